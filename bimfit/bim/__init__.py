@@ -1,0 +1,1 @@
+"""Building models: IFC in, joints and their designed sections, IFC out."""

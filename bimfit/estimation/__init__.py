@@ -1,0 +1,1 @@
+"""From a match to an estimate: posterior, motion along the joint, status."""

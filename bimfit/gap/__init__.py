@@ -1,0 +1,1 @@
+"""The as-built gap: polygon, widths, mesh, volume, files."""

@@ -1,0 +1,1 @@
+"""Poses, frames, profiles, slices: the nouns that every room shares."""

@@ -1,0 +1,1 @@
+"""GRCSM and the matchers it is compared with."""

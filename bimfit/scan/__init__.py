@@ -1,0 +1,1 @@
+"""Scans: line scans and point clouds, cut into slices."""

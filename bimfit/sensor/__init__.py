@@ -1,0 +1,1 @@
+"""The live rangefinder: protocol, driver, emulator."""

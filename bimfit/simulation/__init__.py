@@ -1,0 +1,1 @@
+"""Random joints with known truth, and a virtual rangefinder."""
