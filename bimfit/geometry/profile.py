@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from bimfit.geometry.pose import Array, Pose2D
+
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -24,10 +26,14 @@ class Profile:
         Vertices (u, v) in metres; the last joins the first without being repeated.
     guessed_length : float
         Length of boundary that closes a hole in an open mesh and is a guess, m.
+    artificial : tuple of ndarray of bool, shape (k,)
+        A loop each: which of its edges are no surface of the component, because they close an open mesh or
+        come from clipping. Empty where there are none.
     """
 
     loops: tuple[Array, ...]
     guessed_length: float = 0.0
+    artificial: tuple[Mask, ...] = ()
 
     @classmethod
     def polygon(cls, vertices: ArrayLike, *, holes: Sequence[ArrayLike] = ()) -> Profile:
@@ -55,6 +61,13 @@ class Profile:
         size = np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-300)
         return np.asarray(np.stack([d[:, 1], -d[:, 0]], axis=1) / size)
 
+    @cached_property
+    def surface(self) -> Mask:
+        """Which of ``edges`` are surface of the component, shape (n,)."""
+        if not self.artificial:
+            return np.ones(len(self.edges), bool)
+        return ~np.concatenate(self.artificial)
+
     @property
     def area(self) -> float:
         """Area, m^2; holes count negative."""
@@ -68,7 +81,7 @@ class Profile:
 
     def moved(self, pose: Pose2D) -> Profile:
         """The profile after a rigid motion of the section plane."""
-        return Profile(tuple(pose.apply(loop) for loop in self.loops), self.guessed_length)
+        return Profile(tuple(pose.apply(loop) for loop in self.loops), self.guessed_length, self.artificial)
 
 
 def signed_area(loop: ArrayLike) -> float:
@@ -77,7 +90,8 @@ def signed_area(loop: ArrayLike) -> float:
     if len(p) < 3:
         return 0.0
     x, y = (p - p[0]).T
-    return float(0.5 * (np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))))
+    # about the first vertex, so that the closing edge adds nothing and map coordinates cancel
+    return float(0.5 * (np.dot(x[:-1], y[1:]) - np.dot(y[:-1], x[1:])))
 
 
 def _wound(loop: Array, *, counter_clockwise: bool) -> Array:

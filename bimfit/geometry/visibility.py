@@ -17,7 +17,8 @@ def visible_edges(profiles: Sequence[Profile], viewpoint: ArrayLike) -> tuple[Ar
     """Cut every profile down to what is seen from ``viewpoint``.
 
     An edge counts where its outward normal points towards the sensor and no other edge of any of the
-    profiles is nearer on the same bearing (METHOD, section 2b).
+    profiles is nearer on the same bearing (METHOD, section 2b). Edges that are no surface
+    (``Profile.artificial``) hide others and are not seen themselves.
 
     Parameters
     ----------
@@ -37,11 +38,12 @@ def visible_edges(profiles: Sequence[Profile], viewpoint: ArrayLike) -> tuple[Ar
     edges = np.concatenate([p.edges for p in profiles])
     owner = np.repeat(np.arange(len(profiles)), [len(p.edges) for p in profiles])
     normals = np.concatenate([p.normals for p in profiles])
+    surface = np.concatenate([p.surface for p in profiles])
     facing = np.einsum("ij,ij->i", normals, eye - edges[:, 0]) > 1e-12
-    edges, owner = edges[facing], owner[facing]
+    edges, owner, surface = edges[facing], owner[facing], surface[facing]
     pieces: list[list[Array]] = [[] for _ in profiles]
     for index, piece in _nearest_pieces(edges - eye):
-        if np.linalg.norm(piece[1] - piece[0]) > _MIN_LENGTH:
+        if surface[index] and np.linalg.norm(piece[1] - piece[0]) > _MIN_LENGTH:
             pieces[int(owner[index])].append(piece + eye)
     return tuple(np.array(p).reshape(-1, 2, 2) for p in pieces)
 
