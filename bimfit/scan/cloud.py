@@ -1,0 +1,59 @@
+"""Point clouds: returns without the beams that made them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bimfit.geometry.pose import Array, transform_points
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Points in world coordinates.
+
+    Attributes
+    ----------
+    points : ndarray, shape (n, 3), float64
+        Finite, m.
+    viewpoint : ndarray, shape (3,), or None
+        Where the sensor stood, where the file says so.
+    normals : ndarray, shape (n, 3), or None
+    colors : ndarray, shape (n, 3), uint8, or None
+    intensity : ndarray, shape (n,), or None
+    source : str
+        The file that it is from.
+    notes : tuple of str
+        What a user should know of how it was read.
+    """
+
+    points: Array
+    viewpoint: Array | None = None
+    normals: Array | None = None
+    colors: NDArray[np.uint8] | None = None
+    intensity: Array | None = None
+    source: str = ""
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def bounds(self) -> Array:
+        """Least and greatest corner, shape (2, 3); NaN where there is no point."""
+        if not len(self.points):
+            return np.full((2, 3), np.nan)
+        return np.stack([self.points.min(axis=0), self.points.max(axis=0)])
+
+    def transformed(self, T: ArrayLike) -> PointCloud:
+        """The cloud moved by a rigid 4 x 4 matrix, such as T_world_scanner."""
+        m = np.asarray(T, float)
+        turn = m[:3, :3].T
+        return replace(
+            self,
+            points=transform_points(m, self.points),
+            viewpoint=None if self.viewpoint is None else transform_points(m, self.viewpoint),
+            normals=None if self.normals is None else np.asarray(self.normals @ turn),
+        )
