@@ -1,0 +1,157 @@
+"""The beam model: what a range sensor should have measured, and how likely what it did measure is.
+
+METHOD section 4, steps 3 and 4. A beam that is predicted to meet the component either returns nothing
+(share ``e_m``) or returns at r with density (1 - e_o - e_m) N(r; rho, sigma) + e_o / r_max. A beam that is
+not returns nothing or, with density e_o / r_max, an outlier. Only the difference of the two is summed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bimfit.config import SensorConfig
+from bimfit.estimation import _kernels
+from bimfit.geometry.pose import Array, Pose2D
+from bimfit.geometry.profile import Profile
+from bimfit.geometry.slice import Beams
+
+Ints = NDArray[np.int64]
+_SHARE_FLOOR = 1e-3
+_TABLE = 512
+
+
+@dataclass(frozen=True)
+class BeamModel:
+    """Constants of the mixture.
+
+    Attributes
+    ----------
+    sigma : float
+        Standard deviation of a range, m.
+    amplitude : float
+        A of log(1 + A exp(-d^2 / 2)): the odds of a return on the spot against an outlier there.
+    miss : float
+        log(e_m / (1 - e_m - e_o)): what a beam that returned nothing says against a face in its way.
+    table, scale : ndarray, shape (512,), and float
+        The logarithm above at d^2 = index * scale.
+    outlier_share : float
+        e_o.
+    """
+
+    sigma: float
+    amplitude: float
+    miss: float
+    table: Array
+    scale: float
+    outlier_share: float
+
+    @classmethod
+    def of(
+        cls, sensor: SensorConfig, *, sigma: float | None = None, outliers: float | None = None
+    ) -> BeamModel:
+        """Make the model of a sensor; shares of zero are floored, for nothing is impossible."""
+        s = sensor.sigma if sigma is None else sigma
+        e_o = max(sensor.outlier_share if outliers is None else outliers, _SHARE_FLOOR)
+        e_m = max(sensor.miss_share, _SHARE_FLOOR)
+        amplitude = max(1.0 - e_o - e_m, 0.05) * sensor.max_range / (e_o * s * math.sqrt(2.0 * math.pi))
+        miss = math.log(e_m / max(1.0 - e_m - e_o, 0.05)) if sensor.missing_means_gap else 0.0
+        table = np.empty(_TABLE)
+        scale = 2.0 * math.log(max(amplitude, 2.0) / 1e-3) / (_TABLE - 1)
+        _kernels.log_table(amplitude, scale, table)
+        return cls(s, amplitude, min(miss, 0.0), table, scale, e_o)
+
+
+@dataclass(frozen=True)
+class BeamSet:
+    """Beams sorted for the kernels: by origin, then by pseudo-angle.
+
+    Attributes
+    ----------
+    p, d, r : ndarray, shape (n,), (n, 2), (n,)
+        Pseudo-angle, direction, range (negative where nothing came back).
+    start, eye : ndarray, shape (g + 1,), (g, 4)
+        First beam of every group of one origin; its origin and look direction.
+    order : ndarray, shape (n,)
+        Index of every beam in what it was made from.
+    """
+
+    p: Array
+    d: Array
+    r: Array
+    start: Ints
+    eye: Array
+    order: Ints
+
+    @classmethod
+    def of(cls, beams: Beams) -> BeamSet:
+        """Sort the beams of a slice."""
+        o = np.ascontiguousarray(beams.origins, np.float64)
+        d = np.ascontiguousarray(beams.directions, np.float64)
+        r = np.where(np.isfinite(beams.ranges), beams.ranges, -1.0)
+        n = len(r)
+        group = np.zeros(n, np.int64)
+        if n and float(np.abs(o - o[0]).max()) > 1e-7:
+            _, group = np.unique(np.round(o / 1e-7).astype(np.int64), axis=0, return_inverse=True)
+            group = np.asarray(group, np.int64).reshape(-1)
+        count = int(group.max()) + 1 if n else 0
+        eye = np.empty((count, 4))
+        p = np.empty(n)
+        order = np.empty(n, np.int64)
+        start = np.zeros(count + 1, np.int64)
+        _kernels.sort_beams(o, d, group, count, eye, p, order, start)
+        return cls(p, np.ascontiguousarray(d[order]), np.ascontiguousarray(r[order]), start, eye, order)
+
+    def __len__(self) -> int:
+        return len(self.p)
+
+    def take(self, keep: NDArray[np.bool_]) -> BeamSet:
+        """The beams for which ``keep`` holds; groups left empty stay."""
+        before = np.concatenate([[0], np.cumsum(keep)]).astype(np.int64)
+        return BeamSet(
+            self.p[keep], self.d[keep], self.r[keep], before[self.start], self.eye, self.order[keep]
+        )
+
+    def moved_origin(self, pivot: Array) -> BeamSet:
+        """The same beams in coordinates whose origin is ``pivot``."""
+        eye = self.eye.copy()
+        eye[:, :2] -= pivot
+        return BeamSet(self.p, self.d, self.r, self.start, eye, self.order)
+
+    @property
+    def points(self) -> Array:
+        """Where each beam ended (nonsense for misses), shape (n, 2)."""
+        origin = np.repeat(self.eye[:, :2], np.diff(self.start), axis=0)
+        return np.asarray(origin + self.d * self.r[:, None])
+
+
+def edge_rows(profile: Profile, pose: Pose2D | None = None) -> Array:
+    """Edges of a profile as the kernels take them, shape (m, 6): ends and outward unit normal."""
+    edges, normals = profile.edges, profile.normals
+    if pose is not None:
+        edges, normals = pose.apply(edges), pose.turn(normals)
+    return np.ascontiguousarray(np.concatenate([edges.reshape(-1, 4), normals], axis=1))
+
+
+def predict_ranges(rows: Array, beams: BeamSet) -> tuple[Array, Ints]:
+    """Range of every beam to the first of the edges that faces it.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (m, 6)
+        From :func:`edge_rows`.
+
+    Returns
+    -------
+    rho : ndarray, shape (n,)
+        inf where the beam meets nothing.
+    face : ndarray, shape (n,)
+        Row met, -1 for none.
+    """
+    rho = np.full(len(beams), np.inf)
+    face = np.full(len(beams), -1, np.int64)
+    _kernels.predict(rows, 1.0, 0.0, 0.0, 0.0, beams.p, beams.d, beams.start, beams.eye, rho, face)
+    return rho, face

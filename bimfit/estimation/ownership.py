@@ -1,0 +1,280 @@
+"""Which beams speak for which component, and what covering each of them costs.
+
+METHOD section 4, step 2, and the occlusion of one component by the other. In the first round beams are split
+at the bearing of the combined gap's centre. Where one component hides part of the other, or hardly a beam
+passes between them, a second round repeats each posterior given the other component's estimate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bimfit.estimation import _kernels
+from bimfit.estimation.likelihood import BeamModel, BeamSet
+from bimfit.geometry.pose import Array
+
+Mask = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+_BACKGROUND_DEPTH = 0.3
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Both components predicted at some pose each.
+
+    Attributes
+    ----------
+    rho : tuple of ndarray, shape (n,)
+        Range to A and to B by itself; inf where the beam does not meet it.
+    face : tuple of ndarray, shape (n,)
+        Edge met, -1 for none.
+    """
+
+    rho: tuple[Array, Array]
+    face: tuple[Ints, Ints]
+
+    @property
+    def owner(self) -> Ints:
+        """0 for A, 1 for B, -1 where the beam meets neither."""
+        a, b = self.rho
+        nobody = ~(np.isfinite(a) | np.isfinite(b))
+        return np.where(nobody, -1, np.where(a <= b, 0, 1))
+
+    @property
+    def nearest(self) -> Array:
+        """Range to whichever comes first, inf for neither."""
+        return np.minimum(*self.rho)
+
+
+def split_side(scene: Scene, beams: BeamSet, centre: Array) -> Ints:
+    """Give every beam to the component on whose side of the gap's centre it passes.
+
+    Parameters
+    ----------
+    centre : ndarray, shape (2,)
+        Midpoint of the mouth as placed by the combined pose.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        0 for A, 1 for B, -1 where a group of beams meets neither.
+    """
+    side = np.full(len(beams), -1, np.int64)
+    owner = scene.owner
+    for g in range(len(beams.eye)):
+        s, t = int(beams.start[g]), int(beams.start[g + 1])
+        own, p = owner[s:t], beams.p[s:t]
+        if not np.any(own >= 0):
+            continue
+        ox, oy, lx, ly = beams.eye[g]
+        cx, cy = centre[0] - ox, centre[1] - oy
+        cut = _kernels.pseudo_angle(lx * cx + ly * cy, lx * cy - ly * cx)
+        low, swapped = _best_cut(own, p, cut)
+        side[s:t] = np.where((p < low) != swapped, 0, 1)
+    return side
+
+
+def _best_cut(own: Ints, p: Array, cut: float) -> tuple[float, bool]:
+    """The cut that separates A from B best, preferring ``cut``, and whether B lies below it."""
+    a, b = p[own == 0], p[own == 1]
+    wrong = [int((a >= cut).sum() + (b < cut).sum()), int((a < cut).sum() + (b >= cut).sum())]
+    swapped = wrong[1] < wrong[0]
+    if min(wrong) <= max(2, 0.02 * (len(a) + len(b))) or not len(a) or not len(b):
+        return cut, swapped
+    owned = own >= 0
+    q, w = p[owned], own[owned]
+    changes = np.flatnonzero(w[1:] != w[:-1])
+    if not len(changes):
+        return cut, swapped
+    cuts = 0.5 * (q[changes] + q[changes + 1])
+    below_a = np.searchsorted(a, cuts)
+    below_b = np.searchsorted(b, cuts)
+    straight = (len(a) - below_a) + below_b
+    crossed = below_a + (len(b) - below_b)
+    best = np.minimum(straight, crossed)
+    i = int(np.argmin(best + 1e-6 * np.abs(cuts - cut)))
+    if best[i] >= min(wrong):
+        return cut, swapped
+    return float(cuts[i]), bool(crossed[i] < straight[i])
+
+
+def cover_cost(beams: BeamSet, model: BeamModel, background: Array | None = None) -> Array:
+    """What covering each beam adds to the log-likelihood besides its residual, shape (n,).
+
+    Parameters
+    ----------
+    background : ndarray, shape (n,), optional
+        Log-odds that a return came from behind rather than from nowhere; counts against covering it.
+    """
+    off = np.where(beams.r < 0.0, model.miss, 0.0)
+    return off if background is None else off - np.minimum(background, abs(model.miss))
+
+
+def background_odds(scene: Scene, beams: BeamSet, model: BeamModel, margin: float, max_range: float) -> Array:
+    """Log-odds of 'from a surface behind the joint' against 'outlier', 0 for every other beam; shape (n,).
+
+    A return counts as from behind when it lies more than ``margin`` past the components' surface (carried
+    on across the gap from the nearest covered beams) and a neighbouring beam does so too: floors come in
+    runs, outliers alone.
+    """
+    n = len(beams)
+    out = np.zeros(n)
+    covered = np.flatnonzero(np.isfinite(scene.nearest))
+    if not len(covered):
+        return out
+    surface = np.interp(np.arange(n), covered, scene.nearest[covered])
+    depth = beams.r - surface
+    behind = (beams.r > 0.0) & (depth > margin)
+    run = np.zeros(n, bool)
+    pair = behind[1:] & behind[:-1] & (np.abs(np.diff(beams.r)) < 0.25 * np.maximum(depth[1:], depth[:-1]))
+    run[1:] |= pair
+    run[:-1] |= pair
+    count, missing = int(run.sum()), int((beams.r < 0.0).sum())
+    if count:
+        share = count / (count + missing + 1.0)
+        density = share / _BACKGROUND_DEPTH
+        out[run] = np.log1p(density * max_range / max(1e-3, model.outlier_share))
+    return out
+
+
+def explained_by(rho: Array, beams: BeamSet, model: BeamModel, sigma: float) -> Array:
+    """Log-odds of 'a return from a surface at rho' against 'outlier'; 0 for misses and open beams."""
+    with np.errstate(invalid="ignore"):
+        q = ((beams.r - rho) / sigma) ** 2
+    odds = np.log1p(
+        model.amplitude * model.sigma / sigma * np.exp(-0.5 * np.where(np.isfinite(q), q, np.inf))
+    )
+    return np.asarray(np.where(beams.r > 0.0, odds, 0.0))
+
+
+def first_round(
+    which: int, scene: Scene, side: Ints, beams: BeamSet, off: Array, model: BeamModel, blur: float
+) -> tuple[Mask, Array, Array]:
+    """Beams, costs and limits for one component when the other is known from the combined pose alone."""
+    own, other = scene.rho[which], scene.rho[1 - which]
+    hidden = np.isfinite(other) & (other < own)
+    use = (side == which) & ~(hidden & np.isfinite(own))
+    behind = np.isfinite(other) & (beams.r > 0.0)
+    cost = off.copy()
+    if behind.any():
+        odds = explained_by(other, beams, model, blur)
+        # only what lies deeper than this component's own surface tells against it
+        deeper = ~np.isfinite(own) | (other > own + 3.0 * blur)
+        cost -= np.where(behind & deeper, np.minimum(odds, abs(model.miss)), 0.0)
+    return use, cost, np.full(len(beams), np.inf)
+
+
+def second_round(
+    which: int, scene: Scene, side: Ints, beams: BeamSet, off: Array, model: BeamModel, *, territory: bool
+) -> tuple[Mask, Array, Array]:
+    """The same when the other component has been estimated.
+
+    Returns that the other explains count for it; with ``territory`` they may not be claimed even by a
+    surface that would explain them equally well, for two bodies do not fill the same place.
+    """
+    other = scene.rho[1 - which]
+    sigma = float(np.hypot(model.sigma, 0.001))
+    odds = explained_by(other, beams, model, sigma)
+    with np.errstate(invalid="ignore"):
+        claimed = np.isfinite(other) & (beams.r > 0.0) & (np.abs(beams.r - other) < 4.0 * sigma)
+    foreign = claimed & (side != which)
+    use = (side == which) | foreign | ((beams.r < 0.0) & ~np.isfinite(other))
+    cost = off - np.where(claimed, odds, 0.0)
+    # a beam that the other should have returned speaks for neither when it did not
+    cost = np.where((beams.r < 0.0) & np.isfinite(other), 0.0, cost)
+    if territory:
+        cost = cost - np.where(foreign, abs(model.miss), 0.0)
+    return use, cost, other + 3.0 * sigma
+
+
+def through(scene: Scene, side: Ints, beams: BeamSet, depth: float) -> int:
+    """How many beams between the two components went past them: missing, or from behind.
+
+    Parameters
+    ----------
+    depth : float
+        A return that much farther than the neighbouring surface went past, m.
+    """
+    owner = scene.owner
+    count = 0
+    for g in range(len(beams.eye)):
+        s, t = int(beams.start[g]), int(beams.start[g + 1])
+        if t - s < 3:
+            continue
+        seen = np.flatnonzero(owner[s:t] >= 0)
+        change = np.flatnonzero(np.diff(side[s:t]) != 0)
+        if len(seen) < 2 or len(change) != 1:
+            continue
+        left, right = seen[seen <= change[0]], seen[seen > change[0]]
+        if not len(left) or not len(right):
+            continue
+        i, j = int(left[-1]), int(right[0])
+        surface = max(scene.nearest[s + i], scene.nearest[s + j])
+        r = beams.r[s + i + 1 : s + j]
+        count += int(((r < 0.0) | (r > surface + depth)).sum())
+    return count
+
+
+def kept(mask: Mask, *arrays: Any) -> tuple[Any, ...]:
+    """Every array's rows where ``mask`` holds."""
+    return tuple(a[mask] for a in arrays)
+
+
+def beside_artificial_ends(
+    scene: Scene,
+    side: Ints,
+    beams: BeamSet,
+    edges: tuple[Array, Array],
+    surface: tuple[Mask, Mask],
+    margin: float,
+) -> Mask:
+    """Beams that cannot be judged, because the profile was clipped or guessed there; shape (n,).
+
+    The component goes on where its clipped profile ends: a return beyond the end is no evidence that the
+    profile should be shifted outwards to cover it.
+
+    Parameters
+    ----------
+    edges : tuple of ndarray, shape (m, 2, 2)
+        Both components' edges where the scene has them.
+    surface : tuple of ndarray of bool, shape (m,)
+        Which of them are surface.
+    margin : float
+        Beams that close to such an end are left out too, m.
+    """
+    out = np.zeros(len(beams), bool)
+    for which in (0, 1):
+        if surface[which].all():
+            continue
+        face, rho = scene.face[which], scene.rho[which]
+        met = face >= 0
+        out |= met & ~surface[which][np.maximum(face, 0)]
+        origin = np.repeat(beams.eye[:, :2], np.diff(beams.start), axis=0)
+        hits = origin + beams.d * np.where(met, rho, 0.0)[:, None]
+        close = np.zeros(len(beams), bool)
+        for a, b in edges[which][~surface[which]]:
+            close |= met & (_distance(hits, a, b) < margin)
+        if not close.any():
+            continue
+        out |= close
+        for g in range(len(beams.eye)):
+            s, t = int(beams.start[g]), int(beams.start[g + 1])
+            own = np.flatnonzero(met[s:t])
+            if not len(own):
+                continue
+            if close[s + own[0]]:
+                out[s : s + own[0]] |= side[s : s + own[0]] == which
+            if close[s + own[-1]]:
+                out[s + own[-1] + 1 : t] |= side[s + own[-1] + 1 : t] == which
+    return out
+
+
+def _distance(points: Array, a: Array, b: Array) -> Array:
+    """Distance of points (n, 2) from the segment a b."""
+    w = b - a
+    t = np.clip((points - a) @ w / max(float(w @ w), 1e-300), 0.0, 1.0)
+    return np.asarray(np.linalg.norm(points - a - t[:, None] * w, axis=1))

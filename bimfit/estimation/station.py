@@ -1,0 +1,237 @@
+"""One station: from the combined pose to both components' poses, covariances and status."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bimfit.config import FitConfig, SensorConfig
+from bimfit.estimation import checks
+from bimfit.estimation.cloud import virtual_beams
+from bimfit.estimation.likelihood import BeamModel, BeamSet, edge_rows, predict_ranges
+from bimfit.estimation.ownership import (
+    Ints,
+    Mask,
+    Scene,
+    background_odds,
+    beside_artificial_ends,
+    cover_cost,
+    first_round,
+    second_round,
+    split_side,
+    through,
+)
+from bimfit.estimation.posterior import Posterior, Window, component_posterior
+from bimfit.estimation.result import ComponentEstimate, Residuals, StationEstimate
+from bimfit.estimation.slide import SlideResult, best_start, designed_width
+from bimfit.geometry.joint_section import JointSection
+from bimfit.geometry.pose import Array, Pose2D
+from bimfit.geometry.slice import Slice
+from bimfit.geometry.status import Status
+
+_NEAR = 0.03
+_CLIP_MARGIN = 0.025
+_MIN_HITS = 3
+_FEW_THROUGH = 3
+
+
+@dataclass(frozen=True)
+class _Context:
+    """What every step of one station needs."""
+
+    section: JointSection
+    beams: BeamSet
+    rows: tuple[Array, Array]
+    model: BeamModel
+    sensor: SensorConfig
+    fit: FitConfig
+    virtual: bool
+
+
+def estimate_station(
+    section: JointSection,
+    slice_: Slice,
+    combined: Pose2D | None,
+    sensor: SensorConfig,
+    fit: FitConfig,
+    *,
+    component_matches: tuple[Pose2D | None, Pose2D | None] = (None, None),
+    rivals: Sequence[Pose2D] = (),
+) -> StationEstimate:
+    """Estimate where both components are at one station, and how well that is known.
+
+    Parameters
+    ----------
+    section : JointSection
+        The design.
+    slice_ : Slice
+        What the scan shows, in the section frame.
+    combined : Pose2D or None
+        Motion of both components as one, from the certified search; None when it found nothing.
+    component_matches : tuple of two (Pose2D or None)
+        Each component's own search result: another place to start from, never more than that.
+    rivals : sequence of Pose2D
+        Other combined poses within the search's near-optimal set.
+
+    Returns
+    -------
+    StationEstimate
+        Always; what could not be measured has a status that says why and no pose.
+    """
+    if len(slice_.points) < fit.min_points:
+        reason = f"{len(slice_.points)} returns in the slice, {fit.min_points} are needed"
+        return _nothing(section, slice_, combined, sensor, Status("no_data", reason))
+    if section.components[0].empty or section.components[1].empty:
+        return _nothing(
+            section, slice_, combined, sensor, Status("no_data", "the section plane misses a component")
+        )
+    if combined is None:
+        return _nothing(
+            section, slice_, None, sensor, Status("rejected", "the search found no pose of the joint")
+        )
+    virtual = None
+    if slice_.beams is None or len(slice_.beams.ranges) == 0:
+        virtual = virtual_beams(slice_, section, combined, sensor)
+        beams = BeamSet.of(virtual.beams)
+        if not virtual.spacing_known:
+            sensor = dataclasses.replace(sensor, missing_means_gap=False)
+    else:
+        beams = BeamSet.of(slice_.beams)
+    rows = (edge_rows(section.components[0]), edge_rows(section.components[1]))
+    context = _Context(section, beams, rows, BeamModel.of(sensor), sensor, fit, virtual is not None)
+    slid, off = _place(context, combined, rivals)
+    return _components(context, slice_, slid, off, component_matches, virtual.reason if virtual else "")
+
+
+def _nothing(
+    section: JointSection, slice_: Slice, combined: Pose2D | None, sensor: SensorConfig, status: Status
+) -> StationEstimate:
+    none = ComponentEstimate(status=status)
+    return StationEstimate(slice_.s, combined, (none, none), status, sensor)
+
+
+def _scene(context: _Context, poses: Sequence[Pose2D]) -> Scene:
+    """Predicted ranges of both components at a pose each."""
+    met = [
+        predict_ranges(edge_rows(component, pose), context.beams)
+        for component, pose in zip(context.section.components, poses, strict=True)
+    ]
+    return Scene((met[0][0], met[1][0]), (met[0][1], met[1][1]))
+
+
+def _blur(context: _Context) -> float:
+    return math.hypot(context.sensor.sigma, 1.2 * context.fit.placement_sigma)
+
+
+def _usable(context: _Context, scene: Scene, side: Ints, pose: Pose2D) -> Mask:
+    components = context.section.components
+    surface = (components[0].surface, components[1].surface)
+    if surface[0].all() and surface[1].all():
+        return np.ones(len(context.beams), bool)
+    edges = (pose.apply(components[0].edges), pose.apply(components[1].edges))
+    return ~beside_artificial_ends(scene, side, context.beams, edges, surface, _CLIP_MARGIN)
+
+
+def _place(context: _Context, combined: Pose2D, rivals: Sequence[Pose2D]) -> tuple[SlideResult, Array]:
+    """Slide the combined pose and its rivals; what covering a beam costs there."""
+    scene = _scene(context, (combined, combined))
+    side = split_side(scene, context.beams, np.array([combined.u, combined.v]))
+    odds = background_odds(
+        scene, context.beams, context.model, 1.5 * context.fit.placement_sigma, context.sensor.max_range
+    )
+    off = cover_cost(context.beams, context.model, odds)
+    usable = _usable(context, scene, side, combined)
+    beams, off_used = (context.beams, off) if usable.all() else (context.beams.take(usable), off[usable])
+    slid = best_start(context.section, beams, off_used, (combined, *rivals), context.sensor, context.fit)
+    return slid, off
+
+
+def _window(context: _Context) -> Window:
+    """The component's own window: it scales with the gap, but is never under the placement tolerance."""
+    fit = context.fit
+    half = max(fit.gap_fraction * designed_width(context.section), fit.placement_tolerance)
+    return Window(0.64 * half, fit.component_angle / 1.5, 0.96 * half, 0.24 * half)
+
+
+def _components(
+    context: _Context,
+    slice_: Slice,
+    slid: SlideResult,
+    off: Array,
+    matches: tuple[Pose2D | None, Pose2D | None],
+    reason: str,
+) -> StationEstimate:
+    pose, beams = slid.pose, context.beams
+    scene = _scene(context, (pose, pose))
+    side = split_side(scene, beams, np.array([pose.u, pose.v]))
+    usable = _usable(context, scene, side, pose)
+    window = _window(context)
+    first: list[Posterior | None] = []
+    for which in (0, 1):
+        use, cost, limit = first_round(which, scene, side, beams, off, context.model, _blur(context))
+        first.append(_one(context, which, pose, use & usable, cost, limit, window, matches[which]))
+    posteriors = first
+    poses = [p.pose if p is not None else pose for p in posteriors]
+    scene = _scene(context, poses)
+    depth = max(4.0 * context.sensor.sigma, 1.5 * context.fit.placement_sigma)
+    passed = through(scene, side, beams, depth)
+    both = np.isfinite(scene.rho[0]) & np.isfinite(scene.rho[1])
+    if all(p is not None for p in first) and (bool(np.any(both & usable)) or passed < _FEW_THROUGH):
+        posteriors = list(first)
+        for which in (0, 1):
+            use, cost, limit = second_round(
+                which, scene, side, beams, off, context.model, territory=passed > 0
+            )
+            begin = poses[which]
+            posteriors[which] = _one(context, which, pose, use & usable, cost, limit, window, begin)
+            poses[which] = posteriors[which].pose if posteriors[which] is not None else pose  # type: ignore[union-attr]
+            scene = _scene(context, poses)
+        passed = through(scene, side, beams, depth)
+    residuals = [
+        _residuals(context, which, scene, side, usable) if posteriors[which] is not None else Residuals()
+        for which in (0, 1)
+    ]
+    return checks.judge_station(
+        slice_.s, context.section, slid, (posteriors[0], posteriors[1]), (residuals[0], residuals[1]), window,
+        context.sensor, context.fit, passed, reason, context.virtual,
+    )  # fmt: skip
+
+
+def _one(
+    context: _Context, which: int, prior: Pose2D, use: Mask, cost: Array, limit: Array, window: Window,
+    begin: Pose2D | None,
+) -> Posterior | None:  # fmt: skip
+    """Posterior of one component from the beams in ``use``; None where hardly any meets it."""
+    beams = context.beams.take(use)
+    rho, face = predict_ranges(edge_rows(context.section.components[which], prior), beams)
+    near = (face >= 0) & (beams.r > 0.0) & (np.abs(beams.r - rho) < _NEAR)
+    if int(near.sum()) < _MIN_HITS:
+        return None
+    points = beams.points[near]
+    args = (beams, cost[use], limit[use], points, context.model, window)
+    result = component_posterior(context.rows[which], prior, *args)
+    if begin is not None and _apart(begin, result.pose, result.pivot, context.sensor.sigma):
+        other = component_posterior(context.rows[which], prior, *args, begin=begin)
+        if other.evidence > result.evidence + 1.0:
+            return other
+    return result
+
+
+def _apart(a: Pose2D, b: Pose2D, pivot: Array, sigma: float) -> bool:
+    """Whether two poses differ by more than noise explains where the data are."""
+    back = b.inverse().apply(pivot)
+    return bool(
+        np.hypot(*(a.apply(back) - pivot)) > max(0.003, sigma) or abs(a.theta - b.theta) > math.radians(2.0)
+    )
+
+
+def _residuals(context: _Context, which: int, scene: Scene, side: Ints, usable: Mask) -> Residuals:
+    beams = context.beams
+    blocked = scene.rho[1 - which] < scene.rho[which]
+    return checks.residuals_of(
+        beams, scene.rho[which], scene.face[which], (side == which) & usable & ~blocked, context.sensor.sigma
+    )
