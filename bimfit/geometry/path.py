@@ -219,7 +219,7 @@ class JointPath:
         u = _reject(self.u, n)
         start_n, start_u, end_n, end_u = n.copy(), u.copy(), n.copy(), u.copy()
         count, lengths, smooth = len(n), self.leg_lengths, self._smooth
-        for p in np.flatnonzero(smooth):
+        for p in np.flatnonzero(smooth).tolist():
             i, j = (p - 1) % count, p % count
             w = _turn_share(lengths[i], lengths[j])
             tangent = _turned(n[i : i + 1], n[j : j + 1], np.array([w]))

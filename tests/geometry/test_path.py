@@ -1,5 +1,7 @@
 """Joint paths: closed forms on lines, corners and arcs, and round trips."""
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -129,9 +131,7 @@ def test_projection_agrees_with_a_dense_search():
     points = rng.uniform(-1, 3, (200, 3))
     s = np.linspace(0.0, path.length, 30001)
     spine = np.array([path.rough_frame(x).origin for x in s[::100]])
-    dense = np.concatenate(
-        [np.linspace(a, b, 100, endpoint=False) for a, b in zip(spine, spine[1:], strict=False)]
-    )
+    dense = np.concatenate([np.linspace(a, b, 100, endpoint=False) for a, b in itertools.pairwise(spine)])
     dense = np.vstack([dense, spine[-1:]])
     distance = np.linalg.norm(points[:, None] - dense[None], axis=2)
     found, d = path.project(points)
