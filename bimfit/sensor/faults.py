@@ -1,0 +1,76 @@
+"""What goes wrong on the line, on demand. For the emulator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from bimfit.errors import ConfigError
+
+Kind = Literal[
+    "bad_sum", "flipped_byte", "dropped_byte", "doubled_byte", "truncated", "garbage", "silence", "unplug"
+]
+KINDS: tuple[Kind, ...] = (
+    "bad_sum",
+    "flipped_byte",
+    "dropped_byte",
+    "doubled_byte",
+    "truncated",
+    "garbage",
+    "silence",
+    "unplug",
+)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something that goes wrong.
+
+    Attributes
+    ----------
+    at : float
+        When, s of emulated time since the emulator started; the next scan sent is hit.
+    kind : str
+        ``bad_sum``, ``flipped_byte``, ``dropped_byte``, ``doubled_byte``, ``truncated`` damage that scan;
+        ``garbage`` puts noise ahead of it and leaves it whole; ``silence`` swallows everything for
+        ``length``; ``unplug`` cuts the line in the middle of the scan and plugs the device in again after
+        ``length``, switched off and on.
+    length : float
+        How long silence and unplugging last, s of emulated time.
+    """
+
+    at: float
+    kind: Kind
+    length: float = 0.5
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ConfigError(f"unknown fault {self.kind!r}", remedy="use one of " + ", ".join(KINDS))
+        if not (self.at >= 0.0 and self.length >= 0.0):
+            raise ConfigError("a fault's time and length are at least 0")
+
+
+def damage(scan: bytes, kind: Kind, rng: np.random.Generator) -> bytes:
+    """A scan's bytes as they arrive after the fault; silence and unplugging are not of the bytes."""
+    k = int(rng.integers(len(scan)))
+    if kind == "bad_sum":
+        status = scan.index(b"\n") + 1
+        ends = [i - 1 for i in range(status, len(scan) - 1) if scan[i] == 0x0A]
+        k = ends[int(rng.integers(len(ends)))]
+        wrong = 0x30 + (scan[k] - 0x30 + int(rng.integers(1, 64))) % 64
+        return scan[:k] + bytes((wrong,)) + scan[k + 1 :]
+    if kind == "flipped_byte":
+        return scan[:k] + bytes((scan[k] ^ int(rng.integers(1, 256)),)) + scan[k + 1 :]
+    if kind == "dropped_byte":
+        return scan[:k] + scan[k + 1 :]
+    if kind == "doubled_byte":
+        # Not the first byte, nor the line ends at the end: those harm nothing.
+        k = int(rng.integers(1, len(scan) - 2))
+        return scan[: k + 1] + scan[k:]
+    if kind == "truncated":
+        return scan[:k]
+    if kind == "garbage":
+        return rng.bytes(int(rng.integers(1, 200))) + scan
+    return scan

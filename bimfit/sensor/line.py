@@ -1,0 +1,143 @@
+"""The line to a SCIP device: bytes out, events in, requests and their answers. Knows nothing of streams."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from bimfit.errors import SensorError
+from bimfit.sensor.replies import Damaged, Reply, ReplyParser, ScanReply
+from bimfit.sensor.serial_port import open_port, unplugging
+
+if TYPE_CHECKING:
+    import serial
+
+PATIENCE = 1.0  # s for one answer; a device answers within a turn, 0.1 s
+TICK = 0.02
+
+
+class Line:
+    """An open port and what has come through it.
+
+    Attributes
+    ----------
+    scans : deque of (ScanReply, float)
+        Whole scans not yet taken, each with the host time when its last byte was read.
+    replies : deque of Reply
+        Answers since the last request.
+    damaged, noise : int
+        Broken scans, and other bytes that made no reply.
+    heard : bytes
+        The last bytes that came.
+    """
+
+    def __init__(self, port: str, baud: int, clock: Callable[[], float]) -> None:
+        self.port = port
+        self._clock = clock
+        self._serial: serial.Serial = open_port(port, baud, TICK)
+        self._lock = threading.RLock()
+        self._closed = False
+        self.parser = ReplyParser()
+        self.scans: deque[tuple[ScanReply, float]] = deque()
+        self.replies: deque[Reply] = deque(maxlen=64)
+        self.damaged = 0
+        self.noise = 0
+        self.heard = b""
+        self._stream_echo = ""
+
+    def close(self) -> None:
+        """Close the port; what is half read counts as damaged."""
+        if not self._closed:
+            self._closed = True
+            self._sort(self.parser.flush(), 0.0)
+            self._serial.close()
+
+    def write(self, data: bytes) -> None:
+        """Send bytes. Raises Unplugged."""
+        with self._lock, unplugging():
+            self._serial.write(data)
+
+    def pump(self) -> bool:
+        """Read what is there, waiting a little for a first byte; whether anything came. Raises Unplugged."""
+        with self._lock:
+            with unplugging():
+                data = self._serial.read(max(1, self._serial.in_waiting))
+            if data:
+                self.heard = (self.heard + data)[-60:]
+                self._sort(self.parser.feed(data), self._clock())
+            return bool(data)
+
+    def drain(self, quiet: float, limit: float) -> None:
+        """Read until nothing came for ``quiet`` seconds, at most ``limit`` seconds."""
+        start = last = time.monotonic()
+        while time.monotonic() < min(last + quiet, start + limit):
+            if self.pump():
+                last = time.monotonic()
+
+    def ask(self, request: bytes, patience: float = PATIENCE, tries: int = 2) -> Reply | None:
+        """Send a request and wait for its answer; scans that come meanwhile are kept. Raises Unplugged."""
+        echo = request.rstrip(b"\n").decode("ascii")
+        with self._lock:
+            for _ in range(tries):
+                self.replies.clear()
+                self.write(request.rstrip(b"\n") + b"\n")
+                deadline = time.monotonic() + patience
+                while time.monotonic() < deadline:
+                    self.pump()
+                    for reply in self.replies:
+                        if reply.echo == echo:
+                            return reply
+        return None
+
+    def ask_stream(self, request: bytes) -> Reply | None:
+        """Ask for a stream; scans from before its answer are dropped."""
+        self._stream_echo = request.decode("ascii")
+        return self.ask(request)
+
+    def _sort(self, events: list[Reply | ScanReply | Damaged], arrival: float) -> None:
+        for event in events:
+            if isinstance(event, ScanReply):
+                self.scans.append((event, arrival))
+            elif isinstance(event, Reply):
+                if event.echo == self._stream_echo and event.status == "00":
+                    self.scans.clear()
+                self.replies.append(event)
+            elif event.scan:
+                self.damaged += 1
+            else:
+                self.noise += 1
+
+
+def start_up(line: Line, timeout: float) -> None:
+    """Bring a device to rest in SCIP 2.0, whatever state it was left in. Raises Unplugged.
+
+    Raises
+    ------
+    SensorError
+        When nothing answers, or what answers is no rangefinder.
+    """
+    deadline = time.monotonic() + timeout
+    while time.monotonic() < deadline:
+        line.write(b"\n")  # ends a request that a crashed program left unfinished
+        line.drain(0.03, 0.15)
+        reply = line.ask(b"QT", min(PATIENCE, max(deadline - time.monotonic(), 0.1)), tries=1)
+        if reply is None:
+            continue
+        if reply.status == "E":
+            line.ask(b"SCIP2.0")
+        elif reply.status == "0E":
+            line.ask(b"TM2")
+        elif reply.status in ("00", "0"):
+            return
+    if not line.heard:
+        raise SensorError(
+            "nothing answers", file=line.port, remedy="is this the right port, and has the rangefinder power?"
+        )
+    raise SensorError(
+        f"what answers is no SCIP 2.0 rangefinder: {line.heard[-24:]!r}",
+        file=line.port,
+        remedy="try another port",
+    )
