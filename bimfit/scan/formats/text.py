@@ -1,0 +1,220 @@
+"""Numbers out of text files: fast where all is well, exact about the place where it is not."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from bimfit.errors import ScanError
+from bimfit.geometry.pose import Array
+
+CHUNK = 1 << 25
+"""Bytes of text parsed at a time: what bounds the memory beyond the numbers themselves."""
+
+
+def first_lines(path: Path, size: int = 1 << 16) -> bytes:
+    """The start of a file.
+
+    Raises
+    ------
+    ScanError
+        When it cannot be read or holds nothing.
+    """
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(size)
+    except OSError as error:
+        raise ScanError(f"cannot be read: {error.strerror}", file=path) from error
+    if not head.strip():
+        raise ScanError("the file is empty", file=path)
+    return head
+
+
+def read_table(
+    path: Path,
+    skip: int,
+    delimiter: str,
+    names: Sequence[str],
+    wanted: Sequence[int],
+    may_be_empty: Sequence[int] = (),
+) -> Array:
+    """Read columns of numbers from delimited text.
+
+    Parameters
+    ----------
+    path : Path
+    skip : int
+        Lines before the first row.
+    delimiter : str
+        One character; a space stands for any run of spaces and tabs.
+    names : sequence of str
+        A name for every column of the file, for messages; rows must have just as many cells.
+    wanted : sequence of int
+        Columns to read.
+    may_be_empty : sequence of int
+        Of these, the columns whose empty cells are NaN; elsewhere an empty cell is an error.
+
+    Returns
+    -------
+    ndarray, shape (rows, len(wanted))
+
+    Raises
+    ------
+    ScanError
+        Naming line and column of the first cell that is no number, or the first row of another length.
+    """
+    parts, line = [], skip + 1
+    with path.open("rb") as stream:
+        for _ in range(skip):
+            stream.readline()
+        for block in _whole_lines(stream):
+            parts.append(_parse(path, block, line, delimiter, names, list(wanted), set(may_be_empty)))
+            line += block.count(b"\n")
+    return np.concatenate(parts) if parts else np.zeros((0, len(wanted)))
+
+
+def _whole_lines(stream: BinaryIO) -> Iterator[bytes]:
+    rest = b""
+    while block := stream.read(CHUNK):
+        block = rest + block
+        cut = block.rfind(b"\n") + 1
+        rest = block[cut:]
+        if cut:
+            yield block[:cut].replace(b"\r\n", b"\n")
+    if rest.strip():
+        yield rest.replace(b"\r", b"") + b"\n"
+
+
+def _parse(
+    path: Path,
+    block: bytes,
+    line: int,
+    delimiter: str,
+    names: Sequence[str],
+    wanted: list[int],
+    empty: set[int],
+) -> Array:
+    quick = _quick(block, delimiter, len(names), wanted)
+    if quick is not None:
+        holes = np.asarray(np.isnan(quick).any(axis=0))
+        if not any(holes[k] and column not in empty for k, column in enumerate(wanted)):
+            return quick
+    return _slow(path, block, line, delimiter, names, wanted, empty)
+
+
+def _quick(block: bytes, delimiter: str, width: int, wanted: list[int]) -> Array | None:
+    """Everything at once; None where a row or a cell needs a closer look."""
+    if b'"' in block:
+        return None
+    if delimiter != " ":
+        if not _even(block, ord(delimiter), width):
+            return None
+        mark = delimiter.encode()
+        block = block.replace(mark + b"\n", mark + b"nan\n")
+        if mark + mark in block:
+            for _ in range(2):
+                block = block.replace(mark + mark, mark + b"nan" + mark)
+    try:
+        text = block.decode("ascii")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # "input contained no data": blank lines alone
+            out = np.loadtxt(
+                io.StringIO(text),
+                delimiter=None if delimiter == " " else delimiter,
+                comments=None,
+                usecols=wanted if delimiter != " " else None,
+                ndmin=2,
+            )
+    except (ValueError, UnicodeDecodeError):
+        return None
+    if delimiter == " " and out.size:
+        # without usecols loadtxt itself insists that all rows are of one length
+        return np.asarray(out[:, wanted]) if out.shape[1] == width else None
+    return np.asarray(out.reshape(-1, len(wanted)))
+
+
+def _even(block: bytes, mark: int, width: int) -> bool:
+    """Whether every line that is not blank has ``width`` cells."""
+    data = np.frombuffer(block, np.uint8)
+    ends = np.flatnonzero(data == 10)
+    before = np.searchsorted(np.flatnonzero(data == mark), ends)
+    count = np.diff(before, prepend=0)
+    blank = np.diff(ends, prepend=-1) == 1
+    return bool(np.all((count == width - 1) | blank))
+
+
+def _slow(
+    path: Path,
+    block: bytes,
+    line: int,
+    delimiter: str,
+    names: Sequence[str],
+    wanted: list[int],
+    empty: set[int],
+) -> Array:
+    """A row at a time, to find the cell to blame, or to read what needs more than splitting."""
+    try:
+        text = block.decode("utf-8")
+    except UnicodeDecodeError as error:
+        bad = line + block.count(b"\n", 0, error.start)
+        raise ScanError("not text", file=path, place=f"line {bad}") from error
+    rows = []
+    for number, cells in _rows(path, text, line, delimiter):
+        if len(cells) != len(names):
+            raise ScanError(
+                f"{len(cells)} cells where {len(names)} are expected", file=path, place=f"line {number}"
+            )
+        rows.append([_number(path, cells[k], number, names[k], k in empty) for k in wanted])
+    return np.array(rows, np.float64).reshape(-1, len(wanted))
+
+
+def _rows(path: Path, text: str, line: int, delimiter: str) -> Iterator[tuple[int, list[str]]]:
+    if delimiter == " ":
+        for offset, row in enumerate(text.split("\n")):
+            if row.strip():
+                yield line + offset, row.split()
+        return
+    reader = csv.reader(io.StringIO(text), delimiter=delimiter)
+    try:
+        for cells in reader:
+            if any(cell.strip() for cell in cells):
+                yield line + reader.line_num - 1, cells
+    except csv.Error as error:
+        raise ScanError(f"not CSV: {error}", file=path, place=f"line {line + reader.line_num - 1}") from error
+
+
+def _number(path: Path, cell: str, line: int, name: str, may_be_empty: bool) -> float:
+    text = cell.strip()
+    place = f"line {line}, column {name}"
+    if not text:
+        if may_be_empty:
+            return math.nan
+        raise ScanError("the cell is empty", file=path, place=place)
+    try:
+        value = float(text) if "_" not in text else None
+    except ValueError:
+        value = None
+    if value is None:
+        raise ScanError(f"{text[:40]!r} is not a number", file=path, place=place)
+    if not math.isfinite(value) and not may_be_empty:
+        raise ScanError(f"{text!r} is not a finite number", file=path, place=place)
+    return value
+
+
+def number_at(path: Path, row: int, skip: int) -> int:
+    """The line of the file that holds data row ``row``, counting from 0 and leaving blank lines out."""
+    seen = -1
+    with path.open("rb") as stream:
+        for number, text in enumerate(stream, start=1):
+            if number > skip and text.strip(b" \t\r\n,;"):
+                seen += 1
+                if seen == row:
+                    return number
+    return skip + row + 1
