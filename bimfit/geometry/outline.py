@@ -14,7 +14,7 @@ FACING = float(np.sin(np.radians(12.0)))
 """An edge faces the other component where its outward normal's u-component exceeds this."""
 _PARALLEL = float(np.cos(np.radians(5.0)))
 _CLASH = 0.010  # components that overlap by no more than this still have a gap outline, m
-_LEDGE = 0.030  # ledges up to this long are part of a stepped joint whatever its depth, m
+_LEDGE = 0.030  # ledges up to this long, or 1.5 times the facing depth, belong to a stepped joint, m
 _STEP_GAP = 0.200  # behind a ledge, the other component must be within this, m
 _SAME = 2e-6
 
@@ -177,7 +177,7 @@ def _follow(own: _Boundary, first: int, step: list[int], other: _Boundary, depth
         edge = step[out[-1] if out else first]
         while edge != first and not own.faces(edge):
             ledge.append(edge)
-            if sum(own.size(e) for e in ledge) > max(_LEDGE, depth):
+            if sum(own.size(e) for e in ledge) > max(_LEDGE, 1.5 * depth):
                 return out
             edge = step[edge]
         if edge == first or not _sees(own, edge, other):
