@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from bimfit.config import FitConfig
 from bimfit.errors import ConfigError, JointError
 from bimfit.geometry.frame import SectionFrame
 from bimfit.geometry.joint_section import GapOutline, JointSection
@@ -20,6 +21,8 @@ from bimfit.geometry.section import clip_window, cut
 
 UNIFORM = 1e-6
 """Sections that differ by no more than this are one, m."""
+REACH = FitConfig.reach
+"""How much of the components is kept around the gap unless the caller says otherwise, m."""
 _WIDE = 0.05  # a gap this much beyond twice the joint's usual width is a missing component, m
 
 
@@ -29,6 +32,14 @@ class HasMesh(Protocol):
     @property
     def mesh(self) -> TriangleMesh:
         """Its surface in world coordinates, m."""
+        ...
+
+
+class HasElements(Protocol):
+    """A model, as far as sections need one."""
+
+    def element(self, guid: str) -> HasMesh:
+        """The element of that GlobalId."""
         ...
 
 
@@ -63,7 +74,7 @@ def default_stations(length: float, spacing: float) -> Array:
 
 
 def design_section(
-    element_a: HasMesh, element_b: HasMesh, rough: SectionFrame, s: float, reach: float
+    element_a: HasMesh, element_b: HasMesh, rough: SectionFrame, s: float, reach: float = REACH
 ) -> JointSection | None:
     """Cut two elements at a rough frame and settle the section's frame on their gap.
 
@@ -103,7 +114,7 @@ def design_section(
 
 
 def design_sections(
-    elements: Mapping[str, HasMesh], joint: HasPath, stations: ArrayLike, reach: float
+    elements: HasElements | Mapping[str, HasMesh], joint: HasPath, stations: ArrayLike, reach: float = REACH
 ) -> tuple[JointSection, ...]:
     """Cut a joint's elements at every station.
 
@@ -112,8 +123,8 @@ def design_sections(
 
     Parameters
     ----------
-    elements : mapping of str to HasMesh
-        GlobalId -> element; holds at least the joint's two.
+    elements : Model, or mapping of str to HasMesh
+        Where the joint's two elements are found by their GlobalIds.
     joint : HasPath
         Whose sections; ``elements`` names A, then B.
     stations : array_like, shape (n,)
@@ -132,10 +143,7 @@ def design_sections(
     JointError
         When an element of the joint is not there.
     """
-    for guid in joint.elements:
-        if guid not in elements:
-            raise JointError(f"the joint's element {guid} is not in the model", place=guid)
-    a, b = (elements[guid] for guid in joint.elements)
+    a, b = (_element(elements, guid) for guid in joint.elements)
     found = [
         section
         for s in np.asarray(stations, float).reshape(-1)
@@ -146,6 +154,14 @@ def design_sections(
     widths = np.array([_width(section.gap) for section in found])
     kept = widths <= 2.0 * float(np.median(widths)) + _WIDE
     return _shared([section for section, keep in zip(found, kept, strict=True) if keep])
+
+
+def _element(elements: HasElements | Mapping[str, HasMesh], guid: str) -> HasMesh:
+    if not isinstance(elements, Mapping):
+        return elements.element(guid)
+    if guid not in elements:
+        raise JointError(f"no element has the GlobalId {guid}")
+    return elements[guid]
 
 
 def missing_stations(stations: ArrayLike, sections: Sequence[JointSection]) -> Array:
