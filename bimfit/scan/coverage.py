@@ -1,0 +1,158 @@
+"""Which part of a joint a scan shows, and where along it to cut sections."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from bimfit.geometry.line_scan import LineScan
+from bimfit.geometry.path import JointPath
+from bimfit.geometry.pose import Array
+from bimfit.scan.cloud import PointCloud
+from bimfit.scan.grid import StationGrid
+from bimfit.scan.sweeps import CHUNK, Anchors, anchor_beams, trace_sweeps
+
+NEAREST_SWEEPS = 1e-3
+"""Sweeps nearer to one another than this share a station, m."""
+SLICE_POINTS = 40
+"""How many points within reach a slice of a cloud should have."""
+MOST_STATIONS = 1000
+_BIN_POINTS = 3
+
+
+def covers(scan: LineScan | PointCloud, path: JointPath, reach: float = 0.3) -> float:
+    """Share of a joint's length along which the scan has returns within ``reach`` of it, 0 to 1.
+
+    Parameters
+    ----------
+    scan : LineScan or PointCloud
+    path : JointPath
+    reach : float
+        m.
+    """
+    s = _along(scan, path, reach)
+    if not len(s):
+        return 0.0
+    bins = int(np.clip(math.ceil(path.length / 0.02), 5, 200))
+    if isinstance(scan, LineScan):
+        # one sweep in a bin is enough, and sweeps may be farther apart than bins
+        grid = _path_grid(path)
+        sweeps = sweep_positions(scan, grid, path, reach)
+        if len(sweeps):
+            step = float(np.median(np.diff(sweeps))) if len(sweeps) > 1 else path.length / bins
+            bins = int(np.clip(math.floor(path.length / max(1.5 * step, 1e-9)), 1, bins))
+            s = np.repeat(sweeps, _BIN_POINTS)
+    count = np.histogram(s, bins, (0.0, path.length))[0]
+    return float(np.mean(count >= _BIN_POINTS))
+
+
+def scan_stations(
+    scan: LineScan | PointCloud, path: JointPath, spacing: float | None = None, reach: float = 0.3
+) -> Array:
+    """Where along a joint to cut sections.
+
+    With ``spacing``, on the multiples of it that the scan covers. Without it, at every sweep that lies across
+    the joint (sweeps within 1 mm of one another share a station), or such that slices of a cloud have about
+    40 points within reach, but at least 1 mm apart.
+
+    Parameters
+    ----------
+    scan : LineScan or PointCloud
+    path : JointPath
+    spacing : float, optional
+        m.
+    reach : float
+        What counts as near the joint, m.
+
+    Returns
+    -------
+    ndarray, shape (k,)
+        Ascending, within [0, length]; empty where the scan does not show the joint.
+    """
+    sweeps = np.zeros(0)
+    if isinstance(scan, LineScan):
+        sweeps = sweep_positions(scan, _path_grid(path), path, reach)
+    if spacing is not None:
+        s = sweeps if len(sweeps) else _along(scan, path, reach)
+        return _on_grid(s, spacing, path.length)
+    if len(sweeps):
+        return _merged(sweeps, max(NEAREST_SWEEPS, path.length / MOST_STATIONS))
+    s = _along(scan, path, reach)
+    if not len(s):
+        return s
+    low, high = np.quantile(s, [0.002, 0.998])
+    extent = max(float(high - low), 1e-9)
+    wanted = len(s) / SLICE_POINTS
+    count = int(np.clip(wanted, 1, min(MOST_STATIONS, max(1.0, extent / NEAREST_SWEEPS))))
+    return np.asarray(low + extent * (np.arange(count) + 0.5) / count)
+
+
+def sweep_positions(scan: LineScan, grid: StationGrid, path: JointPath, reach: float) -> Array:
+    """Where the sweeps that lie across a joint cross it, ascending; those beyond its ends left out.
+
+    A sweep that is no farther beyond an end than half the usual distance between sweeps counts as at the end.
+    """
+    anchors = anchor_beams(scan, grid, reach)
+    if not _any_return(scan, anchors):
+        return np.zeros(0)
+    sweeps = trace_sweeps(scan.scan[anchors.index], anchors)
+    s = np.sort(sweeps.s[sweeps.transverse])
+    steps = np.diff(s)
+    steps = steps[steps > NEAREST_SWEEPS]
+    slack = 0.5 * float(np.median(steps)) if len(steps) else NEAREST_SWEEPS
+    s = s[(s >= -slack) & (s <= path.length + slack)]
+    return np.asarray(np.clip(s, 0.0, path.length))
+
+
+def _any_return(scan: LineScan, anchors: Anchors) -> bool:
+    return bool(np.isfinite(scan.ranges[anchors.index]).any())
+
+
+def _path_grid(path: JointPath) -> StationGrid:
+    """Frames dense enough that a crossing found with one of them is right to a fraction of a millimetre."""
+    count = int(np.clip(math.ceil(path.length / 0.01), 2, 2000)) if path.curved or len(path.u) > 1 else 2
+    s = np.linspace(0.0, path.length, count + 1)
+    return StationGrid.of([path.rough_frame(float(x)) for x in s], s)
+
+
+def _along(scan: LineScan | PointCloud, path: JointPath, reach: float) -> Array:
+    """Where along a path its neighbouring returns are, shape (m,); beyond its ends there are none."""
+    low, high = path.points.min(axis=0) - reach, path.points.max(axis=0) + reach
+    ends = [path.rough_frame(0.0), path.rough_frame(path.length)]
+    out = []
+    for start in range(0, len(scan), CHUNK):
+        chunk = slice(start, start + CHUNK)
+        if isinstance(scan, PointCloud):
+            p = scan.points[chunk]
+        else:
+            p = scan.origins[chunk] + scan.directions[chunk] * scan.ranges[chunk, None]
+        p = p[((p >= low) & (p <= high)).all(axis=1)]
+        if not len(p):
+            continue
+        s, distance = path.project(p)
+        near = distance <= reach
+        if not path.closed:
+            near &= ~((s <= 0.0) & ((p - ends[0].origin) @ ends[0].n < 0.0))
+            near &= ~((s >= path.length) & ((p - ends[1].origin) @ ends[1].n > 0.0))
+        out.append(s[near])
+    return np.concatenate(out) if out else np.zeros(0)
+
+
+def _on_grid(s: Array, spacing: float, length: float) -> Array:
+    if not len(s):
+        return s
+    stations = np.arange(math.floor(length / spacing * (1 + 1e-12) + 1e-9) + 1) * spacing
+    low, high = s.min() - 0.5 * spacing, s.max() + 0.5 * spacing
+    return np.minimum(stations[(stations >= low) & (stations <= high)], length)
+
+
+def _merged(s: Array, least: float) -> Array:
+    """Means of runs of ascending ``s`` that are each no longer than ``least``."""
+    groups: list[list[float]] = []
+    for value in s.tolist():
+        if groups and value - groups[-1][0] < least:
+            groups[-1].append(value)
+        else:
+            groups.append([value])
+    return np.array([sum(group) / len(group) for group in groups])
