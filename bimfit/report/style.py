@@ -96,5 +96,5 @@ def save(figure: Figure, path: str | Path, *, formats: Sequence[str] = ("png", "
     # No date and no version: the same figure gives the same bytes.
     metadata = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[kind]
     with whole_file(target) as part:
-        figure.savefig(part, format=kind, metadata=metadata)
+        figure.savefig(part, format=kind, metadata=metadata, bbox_inches="tight", pad_inches=0.12)
     return target
