@@ -82,7 +82,7 @@ class Device:
     laser : bool
         Whether the laser is on at the start.
     late_scan : bool
-        After QT the scan that is being measured still arrives.
+        After the answer to QT one more scan arrives.
     clock : int
         The device's clock at time 0, ms.
     """
@@ -139,11 +139,6 @@ class Device:
         while self._stream is not None and self._ready(self._stream.turn) <= now:
             due.append(self._stream_scan(self._stream))
         return sorted(due, key=lambda packet: packet.time)
-
-    def skip(self, now: float) -> None:
-        """Forget the scans that were due until ``now``: the host does not take them."""
-        if self._stream is not None and not self._stream.request.count:
-            self._stream.turn = max(self._stream.turn, self._turn(now - SCAN_PHASE))
 
     def stamp(self, now: float) -> int:
         """The device's clock, ms, 24 bits."""
@@ -234,7 +229,8 @@ class Device:
         self._pending.clear()
         self._reply(line, "00", now)
         if self.late_scan and stream is not None:
-            self._out.append(self._scan(stream.request, stream.turn, b"99"))
+            turn = max(stream.turn, self._turn(self._out[-1].time - REPLY_PHASE))
+            self._out.append(self._scan(stream.request, turn, b"99"))
         if text == "RS":
             self._motor, self._sensitive, self._baud = 0, 0, 19200
             self.clock = -int(now * 1000.0)
@@ -293,10 +289,7 @@ class Device:
         else:
             self._reply(line, "00", now)
             self.laser = True
-            # The first scan follows the reply, however late in the rotation the request came.
-            self._stream = _Stream(
-                request, self._turn(self._out[-1].time - REPLY_PHASE + 1e-6), request.count
-            )
+            self._stream = _Stream(request, self._turn(now), request.count)
 
     def _check(self, text: str) -> str:
         streams = text[0] == "M"

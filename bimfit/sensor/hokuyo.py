@@ -8,47 +8,20 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from types import FrameType
 from typing import Any
 
 from bimfit.errors import SensorError
 from bimfit.sensor import scip
 from bimfit.sensor.clock import HostClock, StampUnwrapper, host_clock
-from bimfit.sensor.line import Line, start_up
+from bimfit.sensor.counters import Counters
+from bimfit.sensor.line import Line, bound_clock, must_answer, start_up
 from bimfit.sensor.replies import Reply, ScanReply, device_time, fields
 from bimfit.sensor.scip import Parameters, ScanRequest
 from bimfit.sensor.serial_port import Unplugged, find_port
 from bimfit.sensor.sweep import Sweep
 
 SILENCE = 1.0  # s without a scan before the device is started anew
-
-
-@dataclass(frozen=True)
-class Counters:
-    """What has happened since the driver was made.
-
-    Attributes
-    ----------
-    sweeps : int
-        Delivered.
-    damaged : int
-        Scans that came broken and were not delivered.
-    missing : int
-        Turns that should have come, by the device's own clock, and were not delivered: the damaged ones and
-        those of which nothing came. Turns while the device was unplugged are not known and not counted.
-    noise : int
-        Pieces of the stream that were neither reply nor scan.
-    unplugged, silent : int
-        How often the port went away, and how often the device fell silent and was started anew.
-    """
-
-    sweeps: int = 0
-    damaged: int = 0
-    missing: int = 0
-    noise: int = 0
-    unplugged: int = 0
-    silent: int = 0
 
 
 class Hokuyo:
@@ -137,12 +110,12 @@ class Hokuyo:
         atexit.register(self.close)
         try:
             start_up(line, self._timeout)
-            self.version = fields(self._must_answer(line, b"VV"))
-            self.parameters = Parameters.from_fields(fields(self._must_answer(line, b"PP")))
+            self.version = fields(must_answer(line, b"VV"))
+            self.parameters = Parameters.from_fields(fields(must_answer(line, b"PP")))
             self._unwrap = StampUnwrapper()
             self._host = HostClock()
             if self._synchronise:
-                self._ask_clock(line)
+                bound_clock(line, self._clock, self._host, self._unwrap)
         except Unplugged as error:
             self.close()
             raise SensorError("the rangefinder was unplugged", file=line.port) from error
@@ -187,7 +160,7 @@ class Hokuyo:
         """
         line = self._open_line()
         try:
-            return self._must_answer(line, scip.command(name, parameter, string).rstrip())
+            return must_answer(line, scip.command(name, parameter, string).rstrip())
         except Unplugged as error:
             raise SensorError("the rangefinder was unplugged", file=line.port) from error
 
@@ -332,7 +305,7 @@ class Hokuyo:
             if time.monotonic() > deadline:
                 return None
             line.pump()
-            for reply in line.replies:
+            for reply in list(line.replies):
                 if reply.name == request.name and reply.status not in ("00", "98", "99"):
                     self._refused(line, reply)
         return line.scans.popleft()
@@ -412,32 +385,6 @@ class Hokuyo:
                 "the rangefinder is not open", remedy="use it as a context manager, or call open()"
             )
         return self._line
-
-    def _must_answer(self, line: Line, request: bytes) -> Reply:
-        reply = line.ask(request)
-        if reply is None:
-            raise SensorError(f"no answer to {request.decode()}", file=line.port)
-        if not scip.accepted(reply.name, reply.status):
-            what = scip.meaning(reply.name, reply.status)
-            raise SensorError(f"the rangefinder refuses {request.decode()}: {what}", file=line.port)
-        return reply
-
-    def _ask_clock(self, line: Line) -> None:
-        """Bound the offset of the device's clock; a device without the time mode goes without."""
-        reply = line.ask(b"TM0")
-        if reply is None or reply.status not in ("00", "02"):
-            return
-        try:
-            for _ in range(2):
-                sent = self._clock()
-                reply = line.ask(b"TM1", tries=1)
-                received = self._clock()
-                if reply is not None and reply.status == "00" and len(reply.lines) == 1:
-                    stamp = reply.lines[0]
-                    if scip.checksum(stamp[:-1]) == stamp[-1]:
-                        self._host.ask(sent, self._unwrap(scip.decode(stamp[:-1])) / 1000.0, received)
-        finally:
-            line.ask(b"TM2")
 
     def device_seconds(self) -> float:
         """The device's clock now (II), s, on the scale of ``stamp_device``; NaN when it does not say."""

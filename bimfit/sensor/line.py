@@ -9,6 +9,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from bimfit.errors import SensorError
+from bimfit.sensor import scip
+from bimfit.sensor.clock import HostClock, StampUnwrapper
 from bimfit.sensor.replies import Damaged, Reply, ReplyParser, ScanReply
 from bimfit.sensor.serial_port import open_port, unplugging
 
@@ -141,3 +143,37 @@ def start_up(line: Line, timeout: float) -> None:
         file=line.port,
         remedy="try another port",
     )
+
+
+def must_answer(line: Line, request: bytes) -> Reply:
+    """Ask, and insist on a good answer. Raises Unplugged.
+
+    Raises
+    ------
+    SensorError
+        When the answer does not come or is a refusal.
+    """
+    reply = line.ask(request)
+    if reply is None:
+        raise SensorError(f"no answer to {request.decode()}", file=line.port)
+    if not scip.accepted(reply.name, reply.status):
+        what = scip.meaning(reply.name, reply.status)
+        raise SensorError(f"the rangefinder refuses {request.decode()}: {what}", file=line.port)
+    return reply
+
+
+def bound_clock(line: Line, clock: Callable[[], float], host: HostClock, unwrap: StampUnwrapper) -> None:
+    """Ask for the device's clock in its time mode, if it has one. Raises Unplugged."""
+    reply = line.ask(b"TM0")
+    if reply is None or reply.status not in ("00", "02"):
+        return
+    try:
+        for _ in range(2):
+            sent = clock()
+            reply = line.ask(b"TM1", tries=1)
+            received = clock()
+            stamp = reply.lines[0] if reply is not None and reply.status == "00" and reply.lines else b""
+            if len(stamp) == 5 and scip.with_sum(stamp[:-1]) == stamp:
+                host.ask(sent, unwrap(scip.decode(stamp[:-1])) / 1000.0, received)
+    finally:
+        line.ask(b"TM2")

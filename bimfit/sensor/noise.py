@@ -22,7 +22,8 @@ class Noise:
     Attributes
     ----------
     sigma : float or None
-        Standard deviation, m; None is 2.5 mm up to 1 m and 2.5 mm a metre beyond.
+        Standard deviation, m; None is 2.5 mm up to 1 m and 2 mm a metre more beyond: with the values that
+        are held where a surface slopes, 5 mm at 2 m.
     correlation : float
         Correlation of the errors of neighbouring beams.
     held : float
@@ -65,10 +66,13 @@ class Noise:
         seen = np.isfinite(truth) & (truth * 1000.0 >= parameters.dmin) & (truth * 1000.0 <= parameters.dmax)
         seen &= rng.random(truth.shape) >= self.dropouts
         clean = np.where(seen, truth, 0.0)
-        sigma = 0.0025 * np.maximum(clean, 1.0) if self.sigma is None else np.full(truth.shape, self.sigma)
-        noisy = clean + sigma * self._errors(truth.size, rng)
-        noisy = noisy[self._source(clean, sigma, seen, rng)]
-        codes = np.rint(noisy * 1000.0).astype(np.int64)
+        recorded = 0.0005 + 0.002 * np.maximum(clean, 1.0)
+        sigma = recorded if self.sigma is None else np.full(truth.shape, self.sigma)
+        held = self._held(clean, sigma, seen, rng)
+        source = np.maximum.accumulate(np.where(held, 0, np.arange(truth.size)))
+        # The beam after a held one follows what was shown, so errors are counted by beams that are not held.
+        errors = self._errors(truth.size, rng)[np.cumsum(~held) - 1]
+        codes = np.rint((clean[source] + sigma[source] * errors) * 1000.0).astype(np.int64)
         return np.where(seen, np.clip(codes, parameters.dmin, parameters.dmax), _failures(truth, seen, rng))
 
     def _errors(self, n: int, rng: np.random.Generator) -> FloatArray:
@@ -80,15 +84,14 @@ class Noise:
         errors, _ = lfilter([np.sqrt(1.0 - a * a)], [1.0, -a], white, zi=[a * rng.standard_normal()])
         return np.asarray(errors, dtype=np.float64)
 
-    def _source(
+    def _held(
         self, clean: FloatArray, sigma: FloatArray, seen: NDArray[np.bool_], rng: np.random.Generator
-    ) -> IntArray:
-        """Which beam's value each beam shows."""
+    ) -> NDArray[np.bool_]:
+        """Which beams show their neighbour's value; never the first, nor across an edge."""
         held = rng.random(clean.shape) < self.held
         held[0:1] = False
         held[1:] &= seen[1:] & seen[:-1] & (np.abs(np.diff(clean)) <= np.maximum(sigma[1:], 0.001))
-        index = np.where(held, 0, np.arange(clean.size))
-        return np.asarray(np.maximum.accumulate(index), dtype=np.int64)
+        return held
 
 
 NO_NOISE = Noise(sigma=0.0, correlation=0.0, held=0.0, dropouts=0.0)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bimfit.errors import SensorError
+from bimfit.geometry.line_scan import LineScan
 from bimfit.sensor.noise import Noise
 from bimfit.sensor.scip import FloatArray, IntArray, Parameters
 from bimfit.sensor.sweep import Sweep
@@ -28,7 +29,7 @@ class MovingScene:
     ranges: Callable[[FloatArray, FloatArray], FloatArray]
 
 
-Scene = StillScene | MovingScene | Sequence[Sweep] | Sequence[IntArray]
+Scene = StillScene | MovingScene | LineScan | Sequence[Sweep] | Sequence[IntArray]
 
 
 def measurer(
@@ -36,8 +37,9 @@ def measurer(
 ) -> Callable[[float], IntArray]:
     """Turn a scene into what :class:`~bimfit.sensor.device.Device` asks of it.
 
-    A callable is measured with noise. Recorded sweeps, or arrays of raw values for steps amin to amax, are
-    sent as they are, one a rotation, over and over.
+    A callable is measured with noise. Recordings are sent as they are, one sweep a rotation, over and over:
+    line scans, sweeps, or arrays of raw values for steps amin to amax. A line scan does not tell where the
+    sensor's front was; the middle beam of each sweep is taken to look ahead.
 
     Raises
     ------
@@ -52,6 +54,8 @@ def measurer(
     if isinstance(scene, MovingScene):
         moving = scene.ranges
         return lambda start: noise.measure(moving(bearings, start + delays), parameters, rng)
+    if isinstance(scene, LineScan):
+        scene = _from_line_scan(scene, parameters)
     if callable(scene):
         still = scene
         return lambda start: noise.measure(np.asarray(still(bearings)), parameters, rng)
@@ -59,6 +63,30 @@ def measurer(
     if not rows:
         raise SensorError("there is no sweep to replay")
     return lambda start: rows[round(start / parameters.period) % len(rows)]
+
+
+def _from_line_scan(scan: LineScan, parameters: Parameters) -> list[IntArray]:
+    rows = []
+    for number in scan.sweeps:
+        chosen = scan.scan == number
+        directions, ranges = scan.directions[chosen], scan.ranges[chosen]
+        ahead = directions[len(directions) // 2]
+        # Beams are numbered counter-clockwise seen from above, so the first one looks to the right.
+        up = np.cross(directions[0], directions[-1])
+        if np.linalg.norm(np.cross(directions[0], ahead)) > 1e-9:
+            up = np.cross(directions[0], ahead)
+        if np.linalg.norm(up) < 1e-9:
+            up = np.cross(ahead, np.eye(3)[int(np.argmin(np.abs(ahead)))])
+        left = np.cross(up / np.linalg.norm(up), ahead)
+        bearings = np.arctan2(directions @ left, directions @ ahead)
+        steps = np.rint(bearings / (2.0 * np.pi) * parameters.ares).astype(np.int64) + parameters.afrt
+        mm = np.rint(np.nan_to_num(ranges, nan=0.0) * 1000.0).astype(np.int64)
+        values = np.where((mm >= parameters.dmin) & (mm <= parameters.dmax), mm, 0)
+        row = np.zeros(parameters.amax - parameters.amin + 1, dtype=np.int64)
+        inside = (steps >= parameters.amin) & (steps <= parameters.amax)
+        row[steps[inside] - parameters.amin] = values[inside]
+        rows.append(row)
+    return rows
 
 
 def _values(item: Sweep | IntArray, parameters: Parameters) -> IntArray:

@@ -1,14 +1,15 @@
-"""One turn of a rangefinder, and many of them as the arrays of a line scan."""
+"""One turn of a rangefinder, and many of them as a line scan."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bimfit.errors import SensorError
+from bimfit.geometry.line_scan import LineScan
 from bimfit.sensor.scip import FIRST_MEASUREMENT, FloatArray, IntArray, Parameters, ScanRequest, reason
 
 
@@ -93,33 +94,12 @@ class Sweep:
         return np.asarray(self.stamp_host + self.delays, dtype=np.float64)
 
 
-@dataclass(frozen=True)
-class LineArrays:
-    """Beams of many sweeps, a row a beam.
-
-    Attributes
-    ----------
-    scan : ndarray, shape (n,)
-        Which sweep a beam belongs to.
-    origins, directions : ndarray, shape (n, 3)
-        World coordinates, m; directions are of unit length.
-    ranges : ndarray, shape (n,)
-        m; NaN where nothing came back.
-    times : ndarray, shape (n,)
-        When the beam was measured, s since 1970 on the host's clock.
-    """
-
-    scan: IntArray
-    origins: FloatArray
-    directions: FloatArray
-    ranges: FloatArray
-    times: FloatArray
-
-
-def line_arrays(
-    sweeps: Sequence[Sweep], T_world_sensor: FloatArray | Callable[[FloatArray], FloatArray] | None = None
-) -> LineArrays:
-    """Lay sweeps out as the arrays of a line scan.
+def line_scan(
+    sweeps: Sequence[Sweep],
+    T_world_sensor: FloatArray | Callable[[FloatArray], FloatArray] | None = None,
+    source: str = "",
+) -> LineScan:
+    """Lay sweeps out as a line scan, a row a beam; ``time`` and ``code`` are further columns.
 
     Parameters
     ----------
@@ -128,6 +108,8 @@ def line_arrays(
     T_world_sensor : ndarray, shape (4, 4) or (sweeps, 4, 4), or callable (times (n,)) -> (n, 4, 4)
         Where the sensor was: x ahead, y left, z up. One pose, one a sweep, or one for each beam's own time,
         as a sweep is not instantaneous. None: the sensor's own coordinates.
+    source : str
+        Name of the sensor.
 
     Raises
     ------
@@ -136,25 +118,25 @@ def line_arrays(
     """
     if not sweeps:
         raise SensorError("no sweep was measured")
-    counts = [sweep.ranges.size for sweep in sweeps]
-    scan = np.repeat(np.arange(len(sweeps)), counts)
+    scan = np.repeat([sweep.index for sweep in sweeps], [sweep.ranges.size for sweep in sweeps])
     times = np.concatenate([sweep.times for sweep in sweeps])
     bearings = np.concatenate([sweep.bearings for sweep in sweeps])
     local = np.column_stack([np.cos(bearings), np.sin(bearings), np.zeros(bearings.size)])
     given = T_world_sensor(times) if callable(T_world_sensor) else T_world_sensor
     poses = np.asarray(np.eye(4) if given is None else given, dtype=np.float64)
     if not callable(T_world_sensor) and poses.shape == (len(sweeps), 4, 4):
-        poses = poses[scan]
+        poses = np.repeat(poses, [sweep.ranges.size for sweep in sweeps], axis=0)
     elif poses.shape == (4, 4):
         poses = np.broadcast_to(poses, (times.size, 4, 4))
     if poses.shape != (times.size, 4, 4):
         raise SensorError(
             f"poses of shape {poses.shape} do not fit {len(sweeps)} sweeps of {times.size} beams"
         )
-    return LineArrays(
+    made = LineScan.of(
         scan,
-        np.array(poses[:, :3, 3]),
+        poses[:, :3, 3],
         np.einsum("nij,nj->ni", poses[:, :3, :3], local),
         np.concatenate([sweep.ranges for sweep in sweeps]),
-        times,
+        source,
     )
+    return replace(made, extra={"time": times, "code": np.concatenate([sweep.codes for sweep in sweeps])})
