@@ -144,7 +144,7 @@ def _on_grid(s: Array, spacing: float, length: float) -> Array:
         return s
     stations = np.arange(math.floor(length / spacing * (1 + 1e-12) + 1e-9) + 1) * spacing
     low, high = s.min() - 0.5 * spacing, s.max() + 0.5 * spacing
-    return np.minimum(stations[(stations >= low) & (stations <= high)], length)
+    return np.asarray(np.minimum(stations[(stations >= low) & (stations <= high)], length))
 
 
 def _merged(s: Array, least: float) -> Array:
