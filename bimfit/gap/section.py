@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bimfit.gap.clearance import TOUCH, Clearance, measure
+from bimfit.gap.segments import Point
 from bimfit.geometry.frame import SectionFrame
 from bimfit.geometry.joint_section import GapOutline
 from bimfit.geometry.pose import Array, Pose2D
@@ -154,48 +155,61 @@ def gap_section(
     while the gap is open. Where the sides touch or cross these two have kinks, and their deviation is the
     root mean square over the cubature points of the poses' distribution, about the figure given.
     """
-    a, b = pose_a.apply(outline.side_a), pose_b.apply(outline.side_b)
+    designed_a, designed_b = outline.side_a.tolist(), outline.side_b.tolist()
+    a, b = _moved(designed_a, pose_a), _moved(designed_b, pose_b)
     clearance = measure(a, b)
-    (a0u, a0v), (b0u, b0v) = a[0].tolist(), b[0].tolist()
-    across = _direction(outline.side_a[0], outline.side_b[0])
     turn = 0.5 * (pose_a.theta + pose_b.theta)
+    mouth = _Line(a[0], b[0], _direction(designed_a[0], designed_b[0]), turn)
+    root = _Line(a[-1], b[-1], _direction(designed_a[-1], designed_b[-1]), turn)
     sigma = None
     if cov_a is not None and cov_b is not None:
-        sigma = _propagate(outline, (pose_a, pose_b), (a, b), clearance, _joint(cov_a, cov_b, cov_ab))
+        cov = _joint(cov_a, cov_b, cov_ab)
+        sigma = _propagate(outline, (pose_a, pose_b), (a, b), (mouth, root), clearance, cov)
     return GapSection(
         s=float(s),
         frame=frame,
         polygon=clearance.parts[0] if clearance.parts else np.zeros((0, 2)),
-        origin=np.array([0.5 * (a0u + b0u), 0.5 * (a0v + b0v)]),
-        angle=_line_angle(b0u - a0u, b0v - a0v, across, turn),
-        width_mouth=_signed(a[0], b[0], across, turn),
-        width_root=_signed(a[-1], b[-1], _direction(outline.side_a[-1], outline.side_b[-1]), turn),
+        origin=np.array([0.5 * (a[0][0] + b[0][0]), 0.5 * (a[0][1] + b[0][1])]),
+        angle=mouth.angle,
+        width_mouth=mouth.width,
+        width_root=root.width,
         width_narrowest=clearance.narrowest,
         area=clearance.area,
         overlap_area=clearance.overlap_area,
         sigma=sigma,
-        side_a=a,
-        side_b=b,
+        side_a=np.array(a),
+        side_b=np.array(b),
         parts=clearance.parts,
     )
 
 
-def _direction(a: Array, b: Array) -> float:
+def _moved(side: list[list[float]], pose: Pose2D) -> list[Point]:
+    c, s, du, dv = math.cos(pose.theta), math.sin(pose.theta), pose.u, pose.v
+    return [(c * u - s * v + du, s * u + c * v + dv) for u, v in side]
+
+
+def _direction(a: list[float], b: list[float]) -> float:
     """Angle of the designed line from A's corner to B's; along u where they coincide."""
-    (au, av), (bu, bv) = a.tolist(), b.tolist()
-    return math.atan2(bv - av, bu - au) if math.hypot(bu - au, bv - av) > TOUCH else 0.0
+    du, dv = b[0] - a[0], b[1] - a[1]
+    return math.atan2(dv, du) if math.hypot(du, dv) > TOUCH else 0.0
 
 
-def _line_angle(du: float, dv: float, designed: float, turn: float) -> float:
-    """Angle of a line less its design's, modulo pi; the bodies' own turn where it has no length."""
-    angle = math.atan2(dv, du) - designed if math.hypot(du, dv) > 1e-12 else turn
-    return math.pi / 2.0 - (math.pi / 2.0 - angle) % math.pi
+class _Line:
+    """The line from a corner of A to one of B, against its design."""
 
-
-def _signed(a: Array, b: Array, designed: float, turn: float) -> float:
-    (au, av), (bu, bv) = a.tolist(), b.tolist()
-    along = (bu - au) * math.cos(designed + turn) + (bv - av) * math.sin(designed + turn)
-    return math.copysign(math.hypot(bu - au, bv - av), along)
+    def __init__(self, a: Point, b: Point, designed: float, turn: float) -> None:
+        du, dv = b[0] - a[0], b[1] - a[1]
+        self.length = math.hypot(du, dv)
+        expected = (math.cos(designed + turn), math.sin(designed + turn))
+        sign = 1.0 if du * expected[0] + dv * expected[1] >= 0.0 else -1.0
+        #: Negative where B's corner has passed A's.
+        self.width = sign * self.length
+        known = self.length > 1e-12
+        #: From A to B as designed, whichever corner comes first now.
+        self.along = (sign * du / self.length, sign * dv / self.length) if known else expected
+        angle = math.atan2(dv, du) - designed if known else turn
+        # A line's angle is known but for half turns.
+        self.angle = math.pi / 2.0 - (math.pi / 2.0 - angle) % math.pi
 
 
 def _joint(cov_a: ArrayLike, cov_b: ArrayLike, cov_ab: ArrayLike | None) -> Array:
@@ -211,53 +225,60 @@ def _joint(cov_a: ArrayLike, cov_b: ArrayLike, cov_ab: ArrayLike | None) -> Arra
 def _propagate(
     outline: GapOutline,
     poses: tuple[Pose2D, Pose2D],
-    sides: tuple[Array, Array],
+    sides: tuple[list[Point], list[Point]],
+    lines: tuple[_Line, _Line],
     clearance: Clearance,
     cov: Array,
 ) -> GapSigma | None:
-    if not np.isfinite(cov).all():
-        return None
-    a, b = sides
-    shift_a, shift_b = np.array([poses[0].u, poses[0].v]), np.array([poses[1].u, poses[1].v])
+    (a, b), (mouth, root), (pose_a, pose_b) = sides, lines, poses
 
-    def pull(at_a: Array, at_b: Array, force_a: Array, force_b: Array) -> list[float]:
-        # Virtual work: a point of a body moves by (du, dv) + dtheta * perp(point - shift).
-        (fau, fav), (fbu, fbv) = force_a.tolist(), force_b.tolist()
-        (pau, pav), (pbu, pbv) = (at_a - shift_a).tolist(), (at_b - shift_b).tolist()
-        return [fau, fav, pau * fav - pav * fau, fbu, fbv, pbu * fbv - pbv * fbu]
+    def pull(at_a: Point, at_b: Point, fu: float, fv: float, gu: float, gv: float) -> list[float]:
+        # A point of a body moves by (du, dv) + dtheta * perp(point - shift): force times that, for both.
+        lever_a = (at_a[0] - pose_a.u) * fv - (at_a[1] - pose_a.v) * fu
+        lever_b = (at_b[0] - pose_b.u) * gv - (at_b[1] - pose_b.v) * gu
+        return [fu, fv, lever_a, gu, gv, lever_b]
 
-    half_u, half_v = np.array([0.5, 0.0]), np.array([0.0, 0.5])
-    rows = [pull(a[0], b[0], half_u, half_u), pull(a[0], b[0], half_v, half_v)]
-    for corner in (0, -1):
-        d = b[corner] - a[corner]
-        size = max(math.hypot(*d.tolist()), 1e-12)
-        along = d / size
-        rows.append(pull(a[corner], b[corner], -along, along))
-        if corner == 0:
-            turn = np.array([-along[1], along[0]]) / size
-            rows.append(pull(a[0], b[0], -turn, turn))
+    def apart(at_a: Point, at_b: Point, along: Point) -> list[float]:
+        return pull(at_a, at_b, -along[0], -along[1], along[0], along[1])
+
+    across = (-mouth.along[1], mouth.along[0])
+    rows = [
+        pull(a[0], b[0], 0.5, 0.0, 0.5, 0.0),
+        pull(a[0], b[0], 0.0, 0.5, 0.0, 0.5),
+        apart(a[0], b[0], mouth.along),
+        apart(a[0], b[0], across),
+        apart(a[-1], b[-1], root.along),
+    ]
     if clearance.simple:
-        rows.append(_area_row(a - shift_a, b - shift_b, a, b))
-        pa, pb = clearance.nearest
-        along = (pb - pa) / clearance.narrowest
-        rows.append(pull(pa, pb, -along, along))
+        (au, av), (bu, bv) = clearance.nearest
+        size = clearance.narrowest
+        rows.append(_area_row(a, b, poses))
+        rows.append(apart((au, av), (bu, bv), ((bu - au) / size, (bv - av) / size)))
     J = np.array(rows)
-    sd = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", J, cov, J), 0.0)).tolist()
+    variance = np.einsum("ij,ij->i", J @ cov, J).tolist()
+    if not all(map(math.isfinite, variance)):
+        return None
+    sd = [math.sqrt(max(x, 0.0)) for x in variance]
     if not clearance.simple:
         sd += _cubature(outline, poses, clearance, cov)
-    x, y, mouth, angle, root, area, narrowest = sd
-    return GapSigma(x, y, min(angle, _ANY_ANGLE), mouth, area, root, narrowest)
+    x, y, width, sway, width_root, area, narrowest = sd
+    angle = min(sway / mouth.length, _ANY_ANGLE) if mouth.length > 0.0 else _ANY_ANGLE
+    return GapSigma(x, y, angle, width, area, width_root, narrowest)
 
 
-def _area_row(lever_a: Array, lever_b: Array, a: Array, b: Array) -> list[float]:
+def _area_row(a: list[Point], b: list[Point], poses: tuple[Pose2D, Pose2D]) -> list[float]:
     """Gradient of the shoelace area: each vertex weighs half its neighbours' chord, turned."""
-    ring = np.concatenate([a, b[::-1]])
-    chord = 0.5 * (np.roll(ring, -1, axis=0) - np.roll(ring, 1, axis=0))
-    force = np.stack([chord[:, 1], -chord[:, 0]], axis=1)
+    ring = [*a, *reversed(b)]
+    n = len(ring)
     row: list[float] = []
-    for lever, f in ((lever_a, force[: len(a)]), (lever_b[::-1], force[len(a) :])):
-        row += f.sum(axis=0).tolist()
-        row.append(float(lever[:, 0] @ f[:, 1] - lever[:, 1] @ f[:, 0]))
+    for pose, part in zip(poses, (range(len(a)), range(len(a), n)), strict=True):
+        u = v = lever = 0.0
+        for k in part:
+            before, after = ring[k - 1], ring[(k + 1) % n]
+            fu, fv = 0.5 * (after[1] - before[1]), 0.5 * (before[0] - after[0])
+            u, v = u + fu, v + fv
+            lever += (ring[k][0] - pose.u) * fv - (ring[k][1] - pose.v) * fu
+        row += [u, v, lever]
     return row
 
 
@@ -272,7 +293,8 @@ def _cubature(
     for step in np.concatenate([steps.T, -steps.T]):
         p = at + step
         moved = measure(
-            Pose2D.from_array(p[:3]).apply(outline.side_a), Pose2D.from_array(p[3:]).apply(outline.side_b)
+            _moved(outline.side_a.tolist(), Pose2D.from_array(p[:3])),
+            _moved(outline.side_b.tolist(), Pose2D.from_array(p[3:])),
         )
         total += np.square([moved.area - clearance.area, moved.narrowest - clearance.narrowest])
     return [math.sqrt(t / 12.0) for t in total.tolist()]
