@@ -307,9 +307,12 @@ class Emulator:
     def _pull_out(self, half: bytes, length: float) -> None:
         """Let the host read what was sent so far, and the cable is out; later the device starts anew."""
         self._out.append((-math.inf, half))
-        deadline = time.monotonic() + 1.0
-        while (self._out or self._unread()) and time.monotonic() < deadline:
+        start = seen = time.monotonic()
+        # Bytes pass through a buffer of the kernel that cannot be asked, hence some quiet time at the end.
+        while time.monotonic() < min(seen + 0.01, start + 1.0):
             self._write(math.inf)
+            if self._out or self._unread():
+                seen = time.monotonic()
             time.sleep(0.0005)
         self._unplug()
         self._stop.wait(0.05 if math.isinf(self._speed) else length / self._speed)

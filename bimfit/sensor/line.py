@@ -49,6 +49,7 @@ class Line:
         self.noise = 0
         self.heard = b""
         self._stream_echo = ""
+        self._broken = False
 
     def close(self) -> None:
         """Close the port; what is half read counts as damaged."""
@@ -107,10 +108,18 @@ class Line:
                 if event.echo == self._stream_echo and event.status == "00":
                     self.scans.clear()
                 self.replies.append(event)
-            elif event.scan:
-                self.damaged += 1
             else:
-                self.noise += 1
+                self._count(event)
+                continue
+            self._broken = False
+
+    def _count(self, event: Damaged) -> None:
+        # A broken scan may come in pieces; only another echo begins another one.
+        if event.scan and (event.echo or not self._broken):
+            self.damaged += 1
+            self._broken = True
+        elif not self._broken:
+            self.noise += 1
 
 
 def start_up(line: Line, timeout: float) -> None:

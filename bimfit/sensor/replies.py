@@ -77,11 +77,14 @@ class Damaged:
         The first of them, at most 200.
     scan : bool
         Whether they look like what is left of a scan.
+    echo : bool
+        Whether the echo at a scan's beginning is among them.
     """
 
     why: str
     data: bytes
     scan: bool
+    echo: bool
 
 
 Event = Reply | ScanReply | Damaged
@@ -220,8 +223,9 @@ def _belongs(echo: bytes, rest: list[bytes]) -> bool:
 
 def _damaged(lines: list[bytes], why: str) -> Damaged:
     data = b"\n".join(lines)
-    scan = bool(re.search(rb"[MG][DS]\d{10}|99b", data)) or any(len(line) == LINE + 1 for line in lines)
-    return Damaged(why, data[:200], scan)
+    echo = bool(re.search(rb"[MG][DS]\d{10}", data))
+    scan = echo or b"\n99b" in data or any(len(line) == LINE + 1 for line in lines)
+    return Damaged(why, data[:200], scan, echo)
 
 
 def fields(reply: Reply) -> dict[str, str]:
