@@ -104,9 +104,8 @@ def _distinct(ends: Ids) -> Ids:
 
 def _odd(ends: Ids) -> Ids:
     """Points where an odd number of segments ends."""
-    # A segment that is there both ways is one border between touching bodies, or a stray sheet.
-    both = np.unique(np.sort(ends, axis=1), axis=0)
-    names, count = np.unique(both, return_counts=True)
+    # A segment that is there both ways counts twice: it is a border of two touching bodies, or a sheet.
+    names, count = np.unique(ends, return_counts=True)
     return np.asarray(names[count % 2 == 1], np.int64)
 
 

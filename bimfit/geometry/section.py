@@ -234,8 +234,8 @@ def _tidy(loops: list[Array]) -> tuple[Array, ...]:
     for loop in loops:
         first = np.lexsort((loop[:, 1], loop[:, 0]))[0]  # an extreme vertex is a corner
         ring = np.roll(loop, -int(first), axis=0)
-        line = shapely.simplify(shapely.linestrings(np.vstack([ring, ring[:1]])), STRAIGHT, False)
-        slim = shapely.get_coordinates(line)[:-1]
+        line = shapely.LineString(np.vstack([ring, ring[:1]]))
+        slim = shapely.get_coordinates(line.simplify(STRAIGHT, preserve_topology=False))[:-1]
         if len(slim) > 2 and abs(signed_area(slim)) > MIN_AREA:
             out.append(slim)
     return tuple(sorted(out, key=lambda loop: -abs(signed_area(loop))))
