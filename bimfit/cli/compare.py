@@ -1,0 +1,49 @@
+"""``bimfit compare``: the same slices through every method."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import typer
+
+from bimfit.cli.options import build_config, read_pose
+from bimfit.cli.progress import terminal_progress
+
+
+def run(
+    model: Path = typer.Argument(..., metavar="MODEL.ifc", help="The building model."),
+    scan: Path = typer.Argument(..., metavar="SCAN", help="Line scan or point cloud."),
+    output: Path = typer.Option(
+        ..., "-o", "--output", metavar="DIR", help="Where the table and the plots go."
+    ),
+    methods: str | None = typer.Option(
+        None, "--methods", metavar="A,B,...", help="Which methods; default: all."
+    ),
+    truth: Path | None = typer.Option(
+        None, "--truth", metavar="FILE", help="Truth to measure errors against."
+    ),
+    joint: list[str] = typer.Option([], "--joint", metavar="ID|GUID,GUID", help="A joint; may be repeated."),
+    spacing: str | None = typer.Option(None, "--spacing", help="Distance between stations, such as 10mm."),
+    scan_pose: str | None = typer.Option(
+        None, "--scan-pose", metavar="POSE|FILE", help="Scanner pose in the model."
+    ),
+    config: Path | None = typer.Option(None, "--config", metavar="FILE.toml", help="Settings."),
+) -> int:
+    """Run the same slices through every method and compare error, time and failures."""
+    from bimfit.pipeline.compare import DEFAULT_METHODS, compare, comparison_table, write_comparison
+
+    names = (
+        DEFAULT_METHODS
+        if methods is None
+        else tuple(name.strip() for name in methods.split(",") if name.strip())
+    )
+    settings = build_config(config, spacing=spacing)
+    pose = None if scan_pose is None else read_pose(scan_pose)
+    with terminal_progress() as progress:
+        result = compare(
+            model, scan, settings, methods=names, truth=truth, joints=joint, scan_pose=pose, progress=progress
+        )
+        write_comparison(result, output)
+    print(comparison_table(result))
+    print(f"table and plots in {output}")
+    return 0

@@ -1,0 +1,83 @@
+"""``bimfit fit``: the main job."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import typer
+
+from bimfit.cli.options import build_config, read_pose
+from bimfit.cli.progress import terminal_progress
+
+
+def run(
+    model: Path = typer.Argument(..., metavar="MODEL.ifc", help="The building model."),
+    scan: Path = typer.Argument(
+        ..., metavar="SCAN", help="Line scan (csv, npz) or point cloud (ply, pcd, xyz, ...)."
+    ),
+    output: Path = typer.Option(..., "-o", "--output", metavar="DIR", help="Where the results go."),
+    joint: list[str] = typer.Option(
+        [], "--joint", metavar="ID|GUID,GUID", help="A joint to fit; may be repeated."
+    ),
+    method: str = typer.Option(
+        "grcsm", "--method", metavar="M", help="The matcher: grcsm, block, mrcsm, icp-point, ..."
+    ),
+    motion: str = typer.Option(
+        "auto",
+        "--motion",
+        help="Motion along the joint: auto, independent, const, rigid, linear, smooth, kinked.",
+    ),
+    window: str | None = typer.Option(
+        None, "--window", metavar="U,V,THETA", help="Half widths, such as 121.5mm,121.5mm,45deg."
+    ),
+    tolerance: str | None = typer.Option(
+        None, "--tolerance", metavar="U,V,THETA", help="Such as 1mm,1mm,0.6deg."
+    ),
+    spacing: str | None = typer.Option(None, "--spacing", help="Distance between stations, such as 10mm."),
+    thickness: str | None = typer.Option(
+        None, "--thickness", help="Thickness of a cloud's slices, such as 10mm."
+    ),
+    sigma: str | None = typer.Option(None, "--sigma", help="The sensor's range noise, such as 3mm."),
+    scan_pose: str | None = typer.Option(
+        None,
+        "--scan-pose",
+        metavar="POSE|FILE",
+        help="Scanner pose in the model: x,y,z,rx,ry,rz (m, rad) or a file of 16 numbers.",
+    ),
+    config: Path | None = typer.Option(None, "--config", metavar="FILE.toml", help="Settings."),
+    pictures: bool = typer.Option(True, help="Draw pictures."),
+) -> int:
+    """Fit the joints of a model to a scan and write the as-built gap."""
+    from bimfit.pipeline.output import describe, prepare_folder, write_survey
+    from bimfit.pipeline.pictures import write_pictures
+    from bimfit.pipeline.survey import survey
+
+    settings = build_config(
+        config, window=window, tolerance=tolerance, spacing=spacing, thickness=thickness, sigma=sigma
+    )
+    pose = None if scan_pose is None else read_pose(scan_pose)
+    prepare_folder(output)
+    with terminal_progress() as progress:
+        result = survey(
+            model,
+            scan,
+            settings,
+            joints=joint,
+            method=method,
+            motion=motion,
+            scan_pose=pose,
+            progress=progress,
+        )
+        progress("writing", 0.0)
+        write_survey(result, output)
+        if pictures:
+            write_pictures(result, output)
+    for one in result.joints:
+        print(describe(one))
+    print(f"results in {output}")
+    for note in result.notes:
+        print(f"bimfit: note: {note}", file=sys.stderr)
+    for one in result.failed:
+        print(f"bimfit: joint {one.joint.id} could not be estimated: {one.reason}", file=sys.stderr)
+    return 1 if result.failed else 0

@@ -1,0 +1,248 @@
+"""compare(): the same slices through every method."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bimfit.config import Config
+from bimfit.errors import ConfigError, ScanError
+from bimfit.files import protect_inputs, write_text
+from bimfit.geometry.joint_section import JointSection
+from bimfit.geometry.pose import Array
+from bimfit.geometry.slice import Slice
+from bimfit.pipeline.accuracy import joint_errors
+from bimfit.pipeline.fit import METHODS, fit_joint
+from bimfit.pipeline.records import JointResult
+from bimfit.pipeline.results import to_json
+from bimfit.report.tables import MethodOutcome, plot_comparison
+from bimfit.simulation.accuracy import truth_for
+from bimfit.simulation.truth import JointTruth, read_truth
+
+if TYPE_CHECKING:
+    from bimfit.bim.joint import Joint
+
+DEFAULT_METHODS = ("grcsm", "search", "paper", "mrcsm", "icp-point", "icp-plane")
+LOST = 0.010
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class MethodResult:
+    """One method on a set of slices.
+
+    Attributes
+    ----------
+    method : str
+    errors : ndarray, shape (n,)
+        Position errors of the gap's origin, m, against the truth, or else against the first method;
+        NaN where the method gave no pose.
+    angles : ndarray, shape (n,)
+        Signed angle errors, rad.
+    seconds : ndarray, shape (n,)
+        Wall time a slice.
+    evaluations : ndarray, shape (n,)
+        Of the combined search; 0 where a method has none.
+    """
+
+    method: str
+    errors: Array
+    angles: Array
+    seconds: Array
+    evaluations: Array
+
+    def summary(self) -> dict[str, Any]:
+        """The figures of the table."""
+        found = np.isfinite(self.errors)
+        known = self.errors[found]
+        angles = np.degrees(np.abs(self.angles[np.isfinite(self.angles)]))
+        return {
+            "method": self.method,
+            "slices": len(self.errors),
+            "no_pose": int((~found).sum()),
+            "over_10_mm": int((known > LOST).sum()),
+            "mean_mm": float(known.mean() * 1e3) if len(known) else float("nan"),
+            "median_mm": float(np.median(known) * 1e3) if len(known) else float("nan"),
+            "max_mm": float(known.max() * 1e3) if len(known) else float("nan"),
+            "mean_angle_deg": float(angles.mean()) if len(angles) else float("nan"),
+            "median_ms": float(np.median(self.seconds) * 1e3),
+            "p95_ms": float(np.percentile(self.seconds, 95) * 1e3),
+            "median_evaluations": float(np.median(self.evaluations)),
+        }
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All methods on the same slices.
+
+    Attributes
+    ----------
+    methods : tuple of MethodResult
+    reference : str
+        What errors are measured against.
+    """
+
+    methods: tuple[MethodResult, ...]
+    reference: str
+    inputs: tuple[Path, ...] = ()
+
+
+def compare(
+    model_path: Path,
+    scan_path: Path,
+    config: Config,
+    *,
+    methods: Sequence[str] = DEFAULT_METHODS,
+    truth: Path | None = None,
+    joints: Sequence[str] = (),
+    scan_pose: Array | None = None,
+    progress: Progress = lambda step, share: None,
+) -> Comparison:
+    """Fit the joints that a scan shows with every method.
+
+    Raises
+    ------
+    BimfitError
+        For an input that cannot be used, or a method that does not exist.
+    """
+    from bimfit.pipeline.survey import covered_joints, cut_joint, load_scan, model_joints
+
+    check_methods(methods)
+    truths = read_truth(truth) if truth is not None else ()
+    wanted = list(joints) or [",".join(one.elements) for one in truths]
+    model, found = model_joints(model_path, config.joints, wanted)
+    scan = load_scan(scan_path, scan_pose)
+    cuts = [
+        cut_joint(model, joint, scan, config) for joint in covered_joints(found, scan, asked=bool(wanted))
+    ]
+    cuts = [cut for cut in cuts if cut[1]]
+    if not cuts:
+        raise ScanError(
+            "the scan shows none of the joints", file=scan_path, remedy="check its units and frame"
+        )
+    results = run_methods(cuts, config, methods, truths, progress)
+    inputs = tuple(path for path in (model_path, scan_path, truth) if path is not None)
+    return Comparison(results, "truth" if truths else methods[0], inputs)
+
+
+Cut = tuple["Joint", tuple[JointSection, ...], tuple[Slice, ...]]
+
+
+def run_methods(
+    cuts: Sequence[Cut],
+    config: Config,
+    methods: Sequence[str],
+    truths: Sequence[JointTruth] = (),
+    progress: Progress = lambda step, share: None,
+) -> tuple[MethodResult, ...]:
+    """Fit joints that are already cut with every method, one slice after the other."""
+    fitted: dict[str, list[JointResult]] = {}
+    for method in methods:
+        fitted[method] = [
+            fit_joint(
+                joint, sections, slices, config, method=method, motion="independent", threads=1,
+                progress=lambda share, method=method: progress(method, share),  # type: ignore[misc]
+            )
+            for joint, sections, slices in cuts
+        ]  # fmt: skip
+    first = fitted[methods[0]]
+    return tuple(_method_result(method, results, first, truths) for method, results in fitted.items())
+
+
+def _method_result(
+    method: str, results: Sequence[JointResult], first: Sequence[JointResult], truths: Sequence[JointTruth]
+) -> MethodResult:
+    errors, angles = [], []
+    for result, reference in zip(results, first, strict=True):
+        truth = truth_for(result.joint.elements, truths)
+        if truth is not None:
+            against = joint_errors(result, truth)
+            errors.append(against.position)
+            angles.append(against.angle)
+        else:
+            pairs = zip(result.stations, reference.stations, strict=True)
+            rows = [
+                (np.nan, np.nan)
+                if a.gap is None or b.gap is None
+                else (float(np.hypot(*(a.gap.origin - b.gap.origin))), a.gap.angle - b.gap.angle)
+                for a, b in pairs
+            ]
+            errors.append(np.array([row[0] for row in rows]))
+            angles.append(np.array([row[1] for row in rows]))
+    stations = [station for result in results for station in result.stations]
+    evaluations = [0 if s.combined is None else s.combined.evaluations for s in stations]
+    return MethodResult(
+        method,
+        np.concatenate(errors),
+        np.concatenate(angles),
+        np.array([station.seconds for station in stations]),
+        np.array(evaluations, float),
+    )
+
+
+def check_methods(methods: Sequence[str]) -> None:
+    """Refuse methods that do not exist.
+
+    Raises
+    ------
+    ConfigError
+        Naming them and those that do.
+    """
+    unknown = [name for name in methods if name not in METHODS]
+    if unknown or not methods:
+        what = f"unknown method {', '.join(unknown)}" if unknown else "no method named"
+        raise ConfigError(what, remedy=f"choose from {', '.join(METHODS)}")
+
+
+def comparison_table(comparison: Comparison) -> str:
+    """The comparison as text."""
+    head = (
+        f"{'method':18}{'slices':>7}{'no pose':>8}{'>10 mm':>7}{'mean mm':>9}{'max mm':>8}"
+        f"{'mean deg':>9}{'ms':>9}{'p95 ms':>9}{'evaluations':>13}"
+    )
+    lines = [head]
+    for result in comparison.methods:
+        f = result.summary()
+        lines.append(
+            f"{f['method']:18}{f['slices']:7d}{f['no_pose']:8d}{f['over_10_mm']:7d}{f['mean_mm']:9.3f}"
+            f"{f['max_mm']:8.2f}{f['mean_angle_deg']:9.2f}{f['median_ms']:9.2f}{f['p95_ms']:9.2f}"
+            f"{f['median_evaluations']:13.0f}"
+        )
+    return "\n".join(
+        [*lines, f"errors of the gap's origin against the {comparison.reference}; times a slice, one thread"]
+    )
+
+
+def write_comparison(comparison: Comparison, folder: Path) -> tuple[Path, ...]:
+    """Write compare.csv, compare.json and compare.png.
+
+    Raises
+    ------
+    ExportError
+        When the folder cannot be written.
+    """
+    paths = tuple(folder / name for name in ("compare.csv", "compare.json", "compare.png"))
+    protect_inputs(paths, comparison.inputs)
+    rows = [result.summary() for result in comparison.methods]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(paths[0], text.getvalue())
+    slices: Mapping[str, Any] = {
+        result.method: {"error": result.errors, "angle": result.angles, "seconds": result.seconds}
+        for result in comparison.methods
+    }
+    write_text(
+        paths[1], to_json({"schema": 1, "reference": comparison.reference, "methods": rows, "slices": slices})
+    )
+    plot_comparison(
+        paths[2], {r.method: MethodOutcome(r.errors, r.seconds) for r in comparison.methods}, lost=LOST
+    )
+    return paths

@@ -1,0 +1,114 @@
+"""The output folder: every file appears whole, no input is overwritten, nothing stale is left."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bimfit.errors import ExportError
+from bimfit.files import protect_inputs, write_text
+from bimfit.pipeline.records import JointResult, SurveyResult
+from bimfit.pipeline.results import stations_to_csv, survey_to_dict, to_json
+
+if TYPE_CHECKING:
+    from bimfit.gap.mesh import GapMesh
+
+MESH_FORMATS = ("glb", "stl", "ply", "obj", "3mf")
+
+
+def write_survey(
+    survey: SurveyResult, folder: Path, *, formats: Sequence[str] = MESH_FORMATS
+) -> tuple[Path, ...]:
+    """Write meshes, stations.csv and, last, results.json.
+
+    Parameters
+    ----------
+    survey : SurveyResult
+    folder : Path
+        Made when it is not there; files of an earlier run that this run does not write again are removed.
+    formats : sequence of str
+        Mesh formats, the first of which results.json names as ``mesh``.
+
+    Returns
+    -------
+    tuple of Path
+        What was written.
+
+    Raises
+    ------
+    ExportError
+        When the folder cannot be written, or a file in it is an input of the run.
+    """
+    prepare_folder(folder)
+    meshes = {j.joint.id: j.mesh for j in survey.joints if j.mesh is not None}
+    planned = [folder / f"gap-{safe_name(i)}.{f}" for i in meshes for f in formats]
+    planned += [folder / "results.json", folder / "stations.csv"]
+    protect_inputs(planned, (survey.model, survey.scan))
+    stale = _earlier_files(folder) - set(planned)
+    files = {i: _write_meshes(i, mesh, folder, formats) for i, mesh in meshes.items()}
+    write_text(folder / "stations.csv", stations_to_csv(survey.joints))
+    write_text(folder / "results.json", to_json(survey_to_dict(survey, files)))
+    protect_inputs(stale, (survey.model, survey.scan))
+    for path in stale:
+        path.unlink(missing_ok=True)
+    return tuple(planned)
+
+
+def prepare_folder(folder: Path) -> None:
+    """Make the output folder.
+
+    Raises
+    ------
+    ExportError
+        When it cannot be made, or a file has its name.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ExportError(
+            f"cannot be made: {error.strerror}", file=folder, remedy="choose another -o"
+        ) from error
+
+
+def safe_name(joint_id: str) -> str:
+    """A joint's id as part of a file name."""
+    return "".join(c if c.isalnum() or c in "-_." else "_" for c in joint_id)
+
+
+def _write_meshes(joint_id: str, mesh: GapMesh, folder: Path, formats: Sequence[str]) -> dict[str, Any]:
+    from bimfit.gap.export import export_mesh
+
+    names = {f: f"gap-{safe_name(joint_id)}.{f}" for f in formats}
+    offsets = {f: export_mesh(mesh, folder / name).offset for f, name in names.items()}
+    first = formats[0]
+    return {"mesh": names[first], "meshes": names, "mesh_offset": offsets[first], "mesh_offsets": offsets}
+
+
+def _earlier_files(folder: Path) -> set[Path]:
+    """Meshes that an earlier results.json in the folder names, and that therefore are ours to remove."""
+    try:
+        earlier = json.loads((folder / "results.json").read_text(encoding="utf-8"))
+        names = [name for joint in earlier["joints"] for name in (joint.get("meshes") or {}).values()]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return set()
+    return {folder / name for name in names if Path(name).name == name and name.startswith("gap-")}
+
+
+def describe(joint: JointResult) -> str:
+    """One line on a joint, for the terminal."""
+    measured = [s.gap for s in joint.stations if s.gap is not None]
+    if not measured:
+        return f"{joint.joint.id}: not estimated: {joint.reason}"
+    widths = [gap.width_mouth * 1e3 for gap in measured]
+    counts: dict[str, int] = {}
+    for station in joint.stations:
+        counts[station.status.name] = counts.get(station.status.name, 0) + 1
+    statuses = ", ".join(f"{n} {name}" for name, n in sorted(counts.items()))
+    volume = "" if joint.volumes is None else f", volume {joint.volumes.mesh * 1e6:.1f} cm3"
+    return (
+        f"{joint.joint.id}: {joint.joint.kind}, designed {joint.joint.width * 1e3:.1f} mm, mouth "
+        f"{min(widths):.1f} to {max(widths):.1f} mm (mean {sum(widths) / len(widths):.1f}){volume}; "
+        f"{len(joint.stations)} stations: {statuses}"
+    )

@@ -1,0 +1,222 @@
+"""results.json and stations.csv (CONTRACT: schema 1)."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bimfit import __version__
+from bimfit.pipeline.records import ComponentResult, JointResult, StationResult, SurveyResult
+
+if TYPE_CHECKING:
+    from bimfit.gap.section import GapSection
+    from bimfit.geometry.frame import SectionFrame
+    from bimfit.registration.result import MatchResult
+
+SCHEMA = 1
+
+
+def survey_to_dict(survey: SurveyResult, meshes: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """The whole run as results.json holds it.
+
+    Parameters
+    ----------
+    survey : SurveyResult
+    meshes : mapping
+        For each joint id: ``mesh`` (file name) and what else is known of its files, such as ``offset``.
+    """
+    return {
+        "schema": SCHEMA,
+        "bimfit": __version__,
+        "model": str(survey.model),
+        "scan": str(survey.scan),
+        "units": {"length": "m", "angle": "rad"},
+        "notes": list(survey.notes),
+        "joints": [_joint(joint, meshes.get(joint.joint.id, {})) for joint in survey.joints],
+    }
+
+
+def _joint(result: JointResult, files: Mapping[str, Any]) -> dict[str, Any]:
+    volumes = result.volumes
+    return {
+        **result.joint.to_dict(),
+        "method": result.method,
+        "motion": result.motion,
+        "status": "ok" if result.measured else "not estimated",
+        "reason": result.reason,
+        "stations": [_station(station) for station in result.stations],
+        "volume": None
+        if volumes is None
+        else {"slices": volumes.slices, "mesh": volumes.mesh, "sigma": volumes.sigma},
+        "length": result.joint.length,
+        "mesh": None,
+        **files,
+        "seconds": {"joint": result.seconds, "tables": result.table_seconds},
+    }
+
+
+def _station(station: StationResult) -> dict[str, Any]:
+    frame = station.section.frame
+    return {
+        "s": station.section.s,
+        "frame": {axis: getattr(frame, axis) for axis in ("origin", "u", "v", "n")},
+        "status": station.status.name,
+        "reason": station.status.reason,
+        "points": len(station.slice.points),
+        "combined": None if station.combined is None else _search(station.combined, frame),
+        "components": [_component(component, frame) for component in station.components],
+        "gap": None if station.gap is None else _gap(station.gap),
+        "seconds": station.seconds,
+    }
+
+
+def _component(component: ComponentResult, frame: SectionFrame) -> dict[str, Any]:
+    pose = component.pose
+    return {
+        "element": component.element,
+        "transform": None if pose is None else frame.lift(pose).ravel(),
+        "pose": None if pose is None else pose.as_array(),
+        "covariance": component.covariance,
+        "residual": component.rms,
+        "search": None if component.match is None else _search(component.match, frame),
+    }
+
+
+def _search(match: MatchResult, frame: SectionFrame) -> dict[str, Any]:
+    return {
+        "method": match.method,
+        "transform": frame.lift(match.pose).ravel() if match.found else None,
+        "pose": match.parameters if match.found else None,
+        "score": match.score,
+        "bound": match.bound,
+        "evaluations": match.evaluations,
+        "levels": list(match.levels),
+        "stop": match.stop,
+        "fitness": match.fitness,
+        "inlier_rmse": match.inlier_rmse,
+        "modes": [{"pose": mode.parameters, "score": mode.score} for mode in match.modes],
+        "seconds": match.seconds,
+    }
+
+
+def _gap(gap: GapSection) -> dict[str, Any]:
+    sigma = gap.sigma
+    return {
+        "origin": gap.origin_world,
+        "angle": gap.angle,
+        "width": {"mouth": gap.width_mouth, "root": gap.width_root, "narrowest": gap.width_narrowest},
+        "area": gap.area,
+        "overlap": gap.overlap_area,
+        "polygon": gap.polygon_world,
+        "sigma": None
+        if sigma is None
+        else {name: getattr(sigma, name) for name in ("x", "y", "angle", "width", "area")},
+    }
+
+
+def to_json(value: Any) -> str:
+    """JSON text in which what is not known is null: NaN and infinities have no place in it."""
+    return json.dumps(_plain(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+COLUMNS = [
+    "joint",
+    "element_a",
+    "element_b",
+    "kind",
+    "s_m",
+    "status",
+    "reason",
+    "points",
+    "width_mouth_m",
+    "width_root_m",
+    "width_narrowest_m",
+    "area_m2",
+    "angle_rad",
+    "origin_x_m",
+    "origin_y_m",
+    "origin_z_m",
+    "sigma_x_m",
+    "sigma_y_m",
+    "sigma_width_m",
+    "sigma_angle_rad",
+    "sigma_area_m2",
+    "a_u_m",
+    "a_v_m",
+    "a_theta_rad",
+    "b_u_m",
+    "b_v_m",
+    "b_theta_rad",
+    "search_stop",
+    "evaluations",
+]
+
+
+def stations_to_csv(joints: Iterable[JointResult]) -> str:
+    """One row a station, for a spreadsheet; what is not known is left empty."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    for joint in joints:
+        for station in joint.stations:
+            row = {key: value for key, value in _row(joint, station).items() if not _unknown(value)}
+            writer.writerow({key: repr(float(v)) if isinstance(v, float) else v for key, v in row.items()})
+    return text.getvalue()
+
+
+def _unknown(value: Any) -> bool:
+    return value is None or (isinstance(value, float) and not math.isfinite(value))
+
+
+def _row(joint: JointResult, station: StationResult) -> dict[str, Any]:
+    a, b = joint.joint.elements
+    row: dict[str, Any] = {
+        "joint": joint.joint.id,
+        "element_a": a,
+        "element_b": b,
+        "kind": joint.joint.kind,
+        "s_m": float(station.section.s),
+        "status": station.status.name,
+        "reason": station.status.reason,
+        "points": len(station.slice.points),
+    }
+    for name, component in zip("ab", station.components, strict=True):
+        if component.pose is not None:
+            row |= {
+                f"{name}_u_m": component.pose.u,
+                f"{name}_v_m": component.pose.v,
+                f"{name}_theta_rad": component.pose.theta,
+            }
+    if station.combined is not None:
+        row |= {"search_stop": station.combined.stop, "evaluations": station.combined.evaluations}
+    gap = station.gap
+    if gap is not None:
+        row |= {
+            f"width_{name}_m": float(getattr(gap, f"width_{name}")) for name in ("mouth", "root", "narrowest")
+        }
+        row |= {"area_m2": float(gap.area), "angle_rad": float(gap.angle)}
+        row |= {f"origin_{axis}_m": float(x) for axis, x in zip("xyz", gap.origin_world, strict=True)}
+        if gap.sigma is not None:
+            for name, unit in (("x", "m"), ("y", "m"), ("width", "m"), ("angle", "rad"), ("area", "m2")):
+                row[f"sigma_{name}_{unit}"] = float(getattr(gap.sigma, name))
+    return row

@@ -1,0 +1,87 @@
+"""A virtual scan of a model's joints, with its truth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bimfit.bim.stations import design_sections
+from bimfit.config import Config, FitConfig
+from bimfit.errors import JointError
+from bimfit.geometry.line_scan import LineScan, joined
+from bimfit.pipeline.survey import model_joints
+from bimfit.simulation.motion import random_truth
+from bimfit.simulation.rangefinder import simulate_scan
+from bimfit.simulation.scenario import Scenario
+from bimfit.simulation.truth import JointTruth
+
+if TYPE_CHECKING:
+    from bimfit.bim.joint import Joint
+    from bimfit.bim.model import Model
+    from bimfit.geometry.joint_section import JointSection
+
+
+def simulate(
+    model_path: Path,
+    scenario: Scenario,
+    seed: int,
+    *,
+    joints: Sequence[str] = (),
+    config: Config | None = None,
+) -> tuple[LineScan, tuple[JointTruth, ...]]:
+    """Move the components of joints at random and scan them, one joint after the other.
+
+    Parameters
+    ----------
+    model_path : Path
+    scenario : Scenario
+        What moves how far, and the sensor.
+    seed : int
+        The k-th joint uses ``seed + k``.
+    joints : sequence of str
+        Ids or ``GUID,GUID``; empty takes the longest open joint.
+
+    Raises
+    ------
+    BimfitError
+        When the model or a joint cannot be used.
+    """
+    model, found = model_joints(model_path, (config or Config()).joints, joints)
+    chosen = found if joints else (longest_open(found),)
+    scans, truths = [], []
+    for k, joint in enumerate(chosen):
+        sections = designed(model, joint, scenario)
+        truth = random_truth(
+            sections, scenario, seed + k, joint_id=joint.id, elements=joint.elements, kind=joint.kind
+        )
+        scans.append(simulate_scan(sections, truth, scenario, seed + k))
+        truths.append(truth)
+    return joined(scans, f"simulated from {model_path.name}, seed {seed}"), tuple(truths)
+
+
+def designed(model: Model, joint: Joint, scenario: Scenario) -> tuple[JointSection, ...]:
+    """The joint's design where the scenario's sweeps cross it.
+
+    Raises
+    ------
+    JointError
+        When no cross-section shows both components.
+    """
+    sections = design_sections(model, joint, scenario.stations(joint.length), sensor_reach(scenario))
+    if not sections:
+        raise JointError("no cross-section shows a gap between both elements", place=f"joint {joint.id}")
+    return sections
+
+
+def sensor_reach(scenario: Scenario) -> float:
+    """How far from the joint the virtual sensor can meet a component, m, with room for its motion."""
+    opening = min(scenario.bearing_limit + scenario.common_angle, 1.5)
+    wide = scenario.sensor_height * math.tan(opening) + max(scenario.common_shift)
+    return max(FitConfig.reach, min(1.2 * wide, scenario.max_range))
+
+
+def longest_open(joints: Sequence[Joint]) -> Joint:
+    """The longest joint that can be looked into, else the longest."""
+    return max(joints, key=lambda joint: (joint.state == "open", joint.length, joint.id))

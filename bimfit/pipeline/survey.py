@@ -1,0 +1,201 @@
+"""A model and a scan in, every joint that the scan shows out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bimfit.bim.stations import HasElements, HasMesh, design_sections
+from bimfit.config import Config, JointConfig
+from bimfit.errors import JointError, ScanError
+from bimfit.geometry.joint_section import JointSection
+from bimfit.geometry.line_scan import LineScan
+from bimfit.geometry.pose import Array
+from bimfit.geometry.slice import Slice
+from bimfit.pipeline.fit import fit_joint
+from bimfit.pipeline.records import JointResult, SurveyResult
+from bimfit.scan.cloud import PointCloud
+from bimfit.scan.coverage import covers, scan_stations
+from bimfit.scan.slicing import cut_slices
+
+if TYPE_CHECKING:
+    from bimfit.bim.joint import Joint
+    from bimfit.bim.model import Model
+
+Scan = LineScan | PointCloud
+LEAST_COVER = 0.3
+"""A joint that was not asked for by name is fitted where the scan shows at least this share of it."""
+NEAR = 0.3
+SCAN_MARGIN = 0.1
+"""How much farther than the components' profiles the scan is kept, since they may have moved, m."""
+Progress = Callable[[str, float], None]
+
+
+def silent(_step: str, _share: float) -> None:
+    """Report no progress."""
+
+
+def model_joints(
+    path: Path, config: JointConfig, wanted: Sequence[str] = ()
+) -> tuple[Model, tuple[Joint, ...]]:
+    """Load a model and find its joints, or just those that are ``wanted`` by id or ``GUID,GUID``.
+
+    Raises
+    ------
+    ModelError
+        When the model cannot be read or holds no joint.
+    JointError
+        When a joint that is asked for does not exist.
+    """
+    from bimfit.bim.joints import find_joints, select_joints
+    from bimfit.bim.model import load_model
+
+    model = load_model(path)
+    joints = select_joints(model, wanted, config) if wanted else find_joints(model, config)
+    if not joints:
+        raise JointError(
+            f"no joint found: no two of its {len(model.elements)} elements face each other across "
+            f"0 to {config.max_gap * 1e3:.0f} mm over {config.min_length * 1e3:.0f} mm",
+            file=path,
+            remedy="name the pair with --joint GUID,GUID or widen --max-gap",
+        )
+    return model, joints
+
+
+def survey(
+    model_path: Path,
+    scan_path: Path,
+    config: Config,
+    *,
+    joints: Sequence[str] = (),
+    method: str = "grcsm",
+    motion: str = "auto",
+    scan_pose: Array | None = None,
+    progress: Progress = silent,
+) -> SurveyResult:
+    """Fit every joint that is asked for, or every joint that the scan shows.
+
+    Parameters
+    ----------
+    model_path, scan_path : Path
+    config : Config
+    joints : sequence of str
+        Ids or ``GUID,GUID``; empty takes all that the scan covers.
+    method : str
+        A name of :data:`bimfit.registration.matchers.MATCHERS`.
+    motion : str
+        Motion model along the joint.
+    scan_pose : ndarray, shape (4, 4), optional
+        T_world_scanner of a scan in scanner coordinates.
+    progress : callable
+        Told (step, share done).
+
+    Raises
+    ------
+    BimfitError
+        For a model, scan or joint that cannot be used.
+    """
+    progress("reading the model", 0.0)
+    model, found = model_joints(model_path, config.joints, joints)
+    progress("reading the scan", 0.0)
+    scan = load_scan(scan_path, scan_pose)
+    chosen = covered_joints(found, scan, asked=bool(joints))
+    if not chosen:
+        raise ScanError(
+            _far_message(model, scan, bool(joints)),
+            file=scan_path,
+            remedy="check its units and its frame; --scan-pose places a scan that is in scanner coordinates",
+        )
+    results: list[JointResult] = []
+    for k, joint in enumerate(chosen):
+        step = f"joint {joint.id} ({k + 1} of {len(chosen)})"
+        facing, sections, slices = cut_joint(model, joint, scan, config)
+        results.append(
+            fit_joint(
+                facing,
+                sections,
+                slices,
+                config,
+                method=method,
+                motion=motion,
+                progress=partial(progress, step),
+            )
+        )
+    notes = (*model.notes, *scan.notes)
+    return SurveyResult(model_path, scan_path, model, scan, config, tuple(results), notes)
+
+
+def load_scan(path: Path, pose: Array | None = None) -> Scan:
+    """Read a scan and carry it into the model's coordinates.
+
+    Raises
+    ------
+    ScanError
+        When it cannot be read or shows nothing at all.
+    """
+    from bimfit.scan.formats import read_scan
+
+    scan = read_scan(path)
+    return scan if pose is None else scan.transformed(pose)
+
+
+def covered_joints(joints: Sequence[Joint], scan: Scan, *, asked: bool) -> list[Joint]:
+    """Joints that the scan shows: any of their length where they were asked for, else a good part of it."""
+    least = 0.0 if asked else LEAST_COVER
+    return [joint for joint in joints if covers(scan, joint.path) > least]
+
+
+def cut_joint(
+    elements: HasElements | Mapping[str, HasMesh], joint: Joint, scan: Scan, config: Config
+) -> tuple[Joint, tuple[JointSection, ...], tuple[Slice, ...]]:
+    """Cut design and scan at the same stations, the joint's mouth towards the sensor.
+
+    Returns
+    -------
+    tuple
+        The joint as seen, its designed sections, and a slice for each.
+    """
+    eye = viewpoint_of(scan, joint)
+    if eye is not None:
+        joint = joint.facing(eye)
+    stations = scan_stations(scan, joint.path, config.slices.spacing)
+    sections = design_sections(elements, joint, stations) if len(stations) else ()
+    if not sections:
+        return joint, (), ()
+    slices = cut_slices(
+        scan,
+        [section.frame for section in sections],
+        [section.s for section in sections],
+        thickness=config.slices.thickness,
+        reach=config.fit.reach + SCAN_MARGIN,
+    )
+    return joint, tuple(sections), slices
+
+
+def viewpoint_of(scan: Scan, joint: Joint) -> Array | None:
+    """Where the sensor was while it saw the joint, in world coordinates; None when the scan does not say."""
+    if isinstance(scan, PointCloud):
+        return scan.viewpoint
+    low, high = joint.path.points.min(axis=0) - NEAR, joint.path.points.max(axis=0) + NEAR
+    ends = scan.origins + scan.directions * scan.ranges[:, None]
+    near = ((ends >= low) & (ends <= high)).all(axis=1)
+    return scan.origins[near].mean(axis=0) if near.any() else None
+
+
+def _far_message(model: Model, scan: Scan, asked: bool) -> str:
+    low, high = model.bounds
+    bounds = scan.bounds
+    if not np.all(np.isfinite(bounds)):
+        return "the scan holds no return"
+    apart = float(np.linalg.norm(np.maximum(0.0, np.maximum(low - bounds[1], bounds[0] - high))))
+    if apart > NEAR:
+        return f"the scan is far from the model: {apart:.3g} m lie between them"
+    return (
+        "the scan does not show the joint that was asked for"
+        if asked
+        else "the scan shows none of the joints"
+    )
