@@ -88,6 +88,13 @@ class SearchConfig:
         Give up after that many seconds.
     delta : float
         Collect every pose whose score is within ``delta`` times the best score.
+    axis_tests, axis_levels : tuple of 3 int or None
+        ``tests_per_level`` and ``levels`` for each of u, v, theta where they differ.
+    prior_sigma : tuple of 3 float or None
+        Standard deviations of a Gaussian prior on the motion within the window, in u, v (m) and theta
+        (rad); its log, times ``prior_weight``, is added to the score. ``inf`` leaves an axis free.
+    prior_weight : float
+        Points' worth of one unit of log-prior.
     """
 
     window: Triple = (0.1215, 0.1215, math.radians(45.0))
@@ -99,6 +106,10 @@ class SearchConfig:
     max_evaluations: int | None = None
     time_budget: float | None = None
     delta: float = 0.0
+    axis_tests: tuple[int, int, int] | None = None
+    axis_levels: tuple[int, int, int] | None = None
+    prior_sigma: Triple | None = None
+    prior_weight: float = 1.0
 
     def __post_init__(self) -> None:
         if len(self.window) != 3 or len(self.tolerance) != 3:
@@ -115,8 +126,14 @@ class SearchConfig:
             raise ConfigError(f"levels must be at least 1, got {self.levels}")
         if self.bound not in ("majorant", "overlap", "block"):
             raise ConfigError(f"bound is one of majorant, overlap, block; got {self.bound}")
-        if self.eps < 0.0 or self.delta < 0.0:
-            raise ConfigError("eps and delta must be at least 0")
+        if not (self.eps >= 0.0 and self.delta >= 0.0 and self.prior_weight >= 0.0):
+            raise ConfigError("eps, delta and prior_weight must be at least 0")
+        if self.axis_tests is not None and (len(self.axis_tests) != 3 or min(self.axis_tests) < 2):
+            raise ConfigError(f"axis_tests takes three numbers of at least 2, got {self.axis_tests}")
+        if self.axis_levels is not None and (len(self.axis_levels) != 3 or min(self.axis_levels) < 1):
+            raise ConfigError(f"axis_levels takes three numbers of at least 1, got {self.axis_levels}")
+        if self.prior_sigma is not None and not (len(self.prior_sigma) == 3 and min(self.prior_sigma) > 0.0):
+            raise ConfigError(f"prior_sigma takes three positive numbers, got {self.prior_sigma}")
 
 
 @dataclass(frozen=True)
@@ -185,16 +202,28 @@ class JointConfig:
     min_length : float
         Shortest joint, m.
     classes : tuple of str
-        IFC classes to look at; empty: every building element but openings, spaces,
-        doors, windows and furniture.
+        IFC classes to look at, subclasses that begin with the same name included (IfcWall: also
+        IfcWallStandardCase); empty: every building element but openings, spaces, doors, windows and furniture.
+    storeys : tuple of str
+        Names of the storeys to look at; empty: all.
+    min_gap : float or None
+        Narrowest gap, m; None lists touching and overlapping elements too.
+    everything : bool
+        List also what is seldom a joint that anyone works on: cavities that are shut on both sides, large
+        parallel layers ("sheet"), contacts about as short as they are deep ("patch").
     """
 
     max_gap: float = 0.060
     min_length: float = 0.100
     classes: tuple[str, ...] = ()
+    storeys: tuple[str, ...] = ()
+    min_gap: float | None = None
+    everything: bool = False
 
     def __post_init__(self) -> None:
         _positive(self, "max_gap", "min_length")
+        if self.min_gap is not None and not self.min_gap < self.max_gap:
+            raise ConfigError(f"min_gap must be less than max_gap, got {self.min_gap} and {self.max_gap}")
 
 
 @dataclass(frozen=True)

@@ -55,6 +55,8 @@ class MatchResult:
         Rival poses within the asked delta that lie apart from ``parameters``, best first.
     seconds : float
         Wall time of the search alone.
+    quantisation : float
+        Rounding table values and weights to integers changes no score by more than this.
     """
 
     method: str
@@ -69,6 +71,7 @@ class MatchResult:
     inlier_rmse: float = float("nan")
     modes: tuple[Mode, ...] = field(default_factory=tuple)
     seconds: float = 0.0
+    quantisation: float = 0.0
 
     @property
     def gap(self) -> float:

@@ -1,0 +1,719 @@
+"""Every compiled function of the planar search, in one file so that the compiled cache cannot go stale.
+
+The kernels take arrays and plain numbers only; ``table.py`` and ``grcsm.py`` validate and allocate.
+Integers throughout: a bound is a bound of the very scores that it prunes, and sums do not depend on order.
+No ``fastmath``: it assumes that NaN does not exist.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numba as nb
+import numpy as np
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+FULL = 255  # leaf value on the model itself
+LANE = 21  # bits of one of three sums that share a machine word
+LANE_SUM = (1 << LANE) - 1
+NOTHING = -(1 << 40)  # score of no pose at all
+SHIFT_NODE = 20  # bits of one index in a node's code
+
+# slots of the state vector
+HEAP, BEST, BEST_CODE, EVALUATIONS, PHASE, FOUND, BOUND = 0, 1, 2, 3, 4, 5, 6
+STATE_SIZE = 8
+# what a call of ``search`` ends with
+DONE, TOLERANCE, BUDGET, HEAP_FULL, FOUND_FULL = 0, 1, 2, 3, 4
+
+
+def jit(function: F) -> F:
+    """Compile without the interpreter lock; cache on disk where some directory can be written."""
+    try:
+        return nb.njit(nogil=True, cache=True)(function)  # type: ignore[no-any-return]
+    except RuntimeError:  # numba found no directory for its cache: a read-only installation
+        return nb.njit(nogil=True)(function)  # type: ignore[no-any-return]
+
+
+# ---------------------------------------------------------------- tables
+
+
+@jit
+def raster(edges, sigma, ou, ov, qu, qv, height, width):
+    """Leaf table: round(255 exp(-d^2 / 2 sigma^2)), d from a cell's centre to the nearest edge."""
+    out = np.zeros((height, width), np.uint8)
+    reach = sigma * np.sqrt(2.0 * np.log(2.0 * FULL)) * 1.0001
+    for e in range(edges.shape[0]):
+        au, av = edges[e, 0, 0], edges[e, 0, 1]
+        du, dv = edges[e, 1, 0] - au, edges[e, 1, 1] - av
+        size = du * du + dv * dv
+        i0 = max(0, int(np.floor((min(av, av + dv) - reach - ov) / qv)))
+        i1 = min(height - 1, int(np.floor((max(av, av + dv) + reach - ov) / qv)))
+        j0 = max(0, int(np.floor((min(au, au + du) - reach - ou) / qu)))
+        j1 = min(width - 1, int(np.floor((max(au, au + du) + reach - ou) / qu)))
+        for i in range(i0, i1 + 1):
+            pv = ov + (i + 0.5) * qv - av
+            for j in range(j0, j1 + 1):
+                pu = ou + (j + 0.5) * qu - au
+                t = 0.0
+                if size > 0.0:
+                    t = min(1.0, max(0.0, (pu * du + pv * dv) / size))
+                xu, xv = pu - t * du, pv - t * dv
+                value = np.uint8(np.floor(FULL * np.exp(-(xu * xu + xv * xv) / (2.0 * sigma * sigma)) + 0.5))
+                if value > out[i, j]:
+                    out[i, j] = value
+    return out
+
+
+@jit
+def lane_table(leaf):
+    """Three neighbours along u in one word, for cells -1 .. H in v and -3 .. W in u; zero at the rim."""
+    height, width = leaf.shape
+    out = np.zeros((height + 2, width + 4), np.uint64)
+    for i in range(height):
+        for j in range(-2, width):
+            word = np.uint64(0)
+            for m in range(3):
+                if 0 <= j + m < width:
+                    word |= np.uint64(leaf[i, j + m]) << np.uint64(LANE * m)
+            out[i + 1, j + 3] = word
+    return out
+
+
+@jit
+def block_table(leaf, bu, bv, slack, low_u, low_v, out):
+    """Overlapped block maxima: out[b] = max of leaf over b B - slack .. (b + 2) B - 2 + slack an axis."""
+    height, width = leaf.shape
+    rows, columns = out.shape
+    part = np.zeros((height, columns), np.uint8)
+    for i in range(height):
+        for b in range(columns):
+            first = max(0, (b + low_u) * bu - slack)
+            last = min(width - 1, (b + low_u + 2) * bu - 2 + slack)
+            top = np.uint8(0)
+            for j in range(first, last + 1):
+                top = max(top, leaf[i, j])
+            part[i, b] = top
+    for b in range(rows):
+        first = max(0, (b + low_v) * bv - slack)
+        last = min(height - 1, (b + low_v + 2) * bv - 2 + slack)
+        for j in range(columns):
+            top = np.uint8(0)
+            for i in range(first, last + 1):
+                top = max(top, part[i, j])
+            out[b, j] = top
+
+
+@jit
+def affine_table(leaf, ru, rv, pad, shift, out):
+    """Affine majorants: leaf[c + d] 2^shift <= A + gu du + gv dv for |du| <= ru, |dv| <= rv.
+
+    ``out`` (H + 2 pad, W + 2 pad) packs A (16 bits), gu + 128 and gv + 128 (8 bits each).
+    """
+    height, width = leaf.shape
+    one = 1 << shift
+    nu, nv = 2 * ru + 1, 2 * rv + 1
+    scale_u = one * 3.0 / (max(1, ru * (ru + 1)) * nu * nv)
+    scale_v = one * 3.0 / (max(1, rv * (rv + 1)) * nu * nv)
+    if ru == 0:
+        scale_u = 0.0
+    if rv == 0:
+        scale_v = 0.0
+    for y in range(out.shape[0]):
+        for x in range(out.shape[1]):
+            i, j = y - pad, x - pad
+            i0, i1 = max(0, i - rv), min(height - 1, i + rv)
+            j0, j1 = max(0, j - ru), min(width - 1, j + ru)
+            sum_u, sum_v, top = 0, 0, 0
+            for a in range(i0, i1 + 1):
+                line = 0
+                for b in range(j0, j1 + 1):
+                    value = np.int64(leaf[a, b])
+                    line += value
+                    sum_u += value * (b - j)
+                    top = max(top, value)
+                sum_v += line * (a - i)
+            best_a, best_u, best_v = top * one, 0, 0
+            if top > 0:
+                for f in range(1, 6):
+                    gu = min(127, max(-127, int(np.rint(0.25 * f * scale_u * sum_u))))
+                    gv = min(127, max(-127, int(np.rint(0.25 * f * scale_v * sum_v))))
+                    if gu == 0 and gv == 0:
+                        continue
+                    # cells outside the table hold 0 and must be covered too
+                    least = -np.int64(1 << 40)
+                    if i - rv < 0 or i + rv >= height or j - ru < 0 or j + ru >= width:
+                        least = np.int64(abs(gu) * ru + abs(gv) * rv)
+                    for a in range(i0, i1 + 1):
+                        rest = gv * (a - i)
+                        for b in range(j0, j1 + 1):
+                            least = max(least, np.int64(leaf[a, b]) * one - gu * (b - j) - rest)
+                    if least < best_a:
+                        best_a, best_u, best_v = least, gu, gv
+            word = np.uint32(best_a) | (np.uint32(best_u + 128) << np.uint32(16))
+            out[y, x] = word | (np.uint32(best_v + 128) << np.uint32(24))
+
+
+# ---------------------------------------------------------------- cells and leaves
+
+
+@jit
+def fill_cells(it, n, pu, pv, cosine, sine, start, cu, cv):
+    """Cells of all points at angle ``it`` and translation 0; ``pu``, ``pv`` in cells about the pivot.
+
+    ``start`` holds the pivot's cell coordinates and the ratio of the cells' sides.
+    """
+    c, s = cosine[it], sine[it]
+    base = it * n
+    for k in range(n):
+        cu[base + k] = np.int32(np.floor(c * pu[k] - s * start[2] * pv[k] + start[0]))
+        cv[base + k] = np.int32(np.floor(s * start[3] * pu[k] + c * pv[k] + start[1]))
+
+
+@jit
+def score_box(base, n, cu, cv, weight, chunk, lanes, v0, nv, u0, nu, out):
+    """Scores of nv x nu neighbouring translations at one angle, three along u in each word."""
+    height, width = lanes.shape
+    table = lanes.reshape(height * width)
+    words = (nu + 2) // 3
+    for i in range(nv):
+        for m in range(words):
+            left = 3 * m
+            s0, s1, s2 = np.int64(0), np.int64(0), np.int64(0)
+            shift_u, shift_v = u0 + left + 3, v0 + i + 1
+            k = 0
+            while k < n:
+                stop = min(n, k + chunk)
+                word = np.uint64(0)
+                for p in range(k, stop):
+                    x = min(max(cu[base + p] + shift_u, 0), width - 1)
+                    y = min(max(cv[base + p] + shift_v, 0), height - 1)
+                    word += table[np.uint64(y * width + x)] * weight[p]
+                s0 += np.int64(word & np.uint64(LANE_SUM))
+                s1 += np.int64((word >> np.uint64(LANE)) & np.uint64(LANE_SUM))
+                s2 += np.int64(word >> np.uint64(2 * LANE))
+                k = stop
+            out[i * nu + left] = s0
+            if left + 1 < nu:
+                out[i * nu + left + 1] = s1
+            if left + 2 < nu:
+                out[i * nu + left + 2] = s2
+
+
+# ---------------------------------------------------------------- heap
+
+
+@jit
+def before(ka, ca, kb, cb):
+    """Whether entry a leaves the queue before b: greater key, then lesser code."""
+    return ka > kb or (ka == kb and ca < cb)
+
+
+@jit
+def heap_push(keys, codes, size, key, code):
+    """Add an entry to a heap of ``size``."""
+    i = size
+    while i > 0:
+        up = (i - 1) >> 1
+        if not before(key, code, keys[up], codes[up]):
+            break
+        keys[i], codes[i] = keys[up], codes[up]
+        i = up
+    keys[i], codes[i] = key, code
+
+
+@jit
+def heap_pop(keys, codes, size):
+    """Remove the first entry of a heap of ``size``; what is left has ``size - 1``."""
+    last = size - 1
+    key, code = keys[last], codes[last]
+    i = 0
+    while True:
+        child = 2 * i + 1
+        if child >= last:
+            break
+        if child + 1 < last and before(keys[child + 1], codes[child + 1], keys[child], codes[child]):
+            child += 1
+        if not before(keys[child], codes[child], key, code):
+            break
+        keys[i], codes[i] = keys[child], codes[child]
+        i = child
+    keys[i], codes[i] = key, code
+
+
+# ---------------------------------------------------------------- search
+
+
+@jit
+def pack(t, v, u):
+    """One code for three indices; codes compare lexicographically as (theta, v, u)."""
+    return (np.int64(t) << (2 * SHIFT_NODE)) | (np.int64(v) << SHIFT_NODE) | np.int64(u)
+
+
+@jit
+def keeps(bound, code, cut, cut_code):
+    """Whether a node may hold a leaf that beats the incumbent, ties in lexicographic order."""
+    return bound > cut or (bound == cut and code < cut_code)
+
+
+@jit
+def ensure_cells(it, n, pu, pv, cosine, sine, start, cu, cv, have):
+    """Compute the cells at angle ``it`` unless they are there."""
+    if have[it] == 0:
+        fill_cells(it, n, pu, pv, cosine, sine, start, cu, cv)
+        have[it] = 1
+
+
+@jit
+def merge_blocks(t, level, n, size, cu, cv, weight, classes, row, lists, counts, slot):
+    """Blocks that the points fall into at one (level, angle), neighbours merged; kept in ``lists``.
+
+    Rows of ``lists``: block in u, block in v, slack class, weight.
+    """
+    bu, bv, bt = size[level, 0], size[level, 1], size[level, 2]
+    base = (t * bt + bt // 2) * n
+    first = slot * n
+    m = first - 1
+    last_u, last_v, last_c = np.int64(-(1 << 40)), np.int64(0), np.int64(0)
+    for k in range(n):
+        x = np.int64(cu[base + k]) // bu
+        y = np.int64(cv[base + k]) // bv
+        c = np.int64(classes[row * n + k])
+        if x == last_u and y == last_v and c == last_c:
+            lists[3, m] += np.int32(weight[k])
+        else:
+            m += 1
+            lists[0, m], lists[1, m], lists[2, m] = np.int32(x), np.int32(y), np.int32(c)
+            lists[3, m] = np.int32(weight[k])
+            last_u, last_v, last_c = x, y, c
+    counts[slot] = m - first + 1
+
+
+@jit
+def bound_box(slot, n, lists, counts, blocks, place, v0, nv, u0, nu, out):
+    """Block bounds of nv x nu neighbouring nodes at one (level, angle).
+
+    ``place`` (classes, 5): offset into ``blocks``, rows, columns, lowest block in u and v.
+    """
+    for i in range(nv * nu):
+        out[i] = 0
+    for m in range(slot * n, slot * n + counts[slot]):
+        where = place[lists[2, m]]
+        weight = np.int64(lists[3, m])
+        x = np.int64(lists[0, m]) + u0 - where[3]
+        y = np.int64(lists[1, m]) + v0 - where[4]
+        i0, i1 = max(0, -y), min(nv, where[1] - y)
+        j0, j1 = max(0, -x), min(nu, where[2] - x)
+        for i in range(i0, i1):
+            line = where[0] + (y + i) * where[2] + x
+            for j in range(j0, j1):
+                out[np.uint64(i * nu + j)] += weight * np.int64(blocks[np.uint64(line + j)])
+
+
+@jit
+def point_classes(n, pu, pv, qu, qv, eta, class_of, out):
+    """Slack class of every point on every level; ``eta`` (levels,) is half a node's angle.
+
+    A point at radius rho moves by at most 2 rho sin(min(eta, pi) / 2), so its cell by at most that
+    many cells, rounded up. ``class_of`` (levels, slacks) maps cells of slack to a class.
+    """
+    last = class_of.shape[1] - 1
+    for level in range(eta.shape[0]):
+        arm = 2.0 * np.sin(0.5 * min(eta[level], np.pi)) / min(qu, qv)
+        for k in range(n):
+            move = arm * np.sqrt(pu[k] * pu[k] * qu * qu + pv[k] * pv[k] * qv * qv)
+            slack = 0
+            if move > 0.0:
+                slack = int(np.ceil(move + 1e-9))
+            out[level * n + k] = class_of[level, min(slack, last)]
+
+
+@jit
+def affine_classes(t, bt, n, cu, cv, class_of, out):
+    """Slack class of every point at one (level, angle) from the cells at the interval's very angles."""
+    middle = (t * bt + bt // 2) * n
+    last = class_of.shape[0] - 1
+    for k in range(n):
+        slack = 0
+        for i in range(bt):
+            other = (t * bt + i) * n
+            slack = max(slack, abs(cu[other + k] - cu[middle + k]), abs(cv[other + k] - cv[middle + k]))
+        out[t * n + k] = class_of[min(slack, last)]
+
+
+@jit
+def affine_pass(base, class_base, n, cu, cv, weight, du, dv, where, tables, classes, gu, gv, sums):
+    """Sum of majorants at one pose: constants and slopes into ``sums``, weighted slopes a point kept.
+
+    ``where``: offset into ``tables``, rows, columns, rim.
+    """
+    rows, columns, pad = where[1], where[2], where[3]
+    offset, stride = where[0], where[1] * where[2]
+    total, total_u, total_v = np.int64(0), np.int64(0), np.int64(0)
+    for k in range(n):
+        x = min(max(np.int64(cu[base + k]) + du + pad, 0), columns - 1)
+        y = min(max(np.int64(cv[base + k]) + dv + pad, 0), rows - 1)
+        word = np.int64(tables[np.uint64(offset + classes[class_base + k] * stride + y * columns + x)])
+        w = np.int64(weight[k])
+        a = w * (((word >> 16) & 255) - 128)
+        b = w * ((word >> 24) - 128)
+        total += w * (word & 65535)
+        total_u += a
+        total_v += b
+        gu[k] = np.int32(a)
+        gv[k] = np.int32(b)
+    sums[0], sums[1], sums[2] = total, total_u, total_v
+
+
+@jit
+def turn_gain(base, other, n, cu, cv, gu, gv):
+    """Sum of slope times cells moved between two angles."""
+    total = np.int64(0)
+    for k in range(n):
+        total += np.int64(gu[k] * (cu[other + k] - cu[base + k]) + gv[k] * (cv[other + k] - cv[base + k]))
+    return total
+
+
+@jit
+def search(
+    options, pu, pv, weight, start, cosine, sine, size, count, lanes, blocks, place, affine, affine_place,
+    class_of, classes, slots, prior, prior_at, cu, cv, have, lists, list_counts, near, near_have, gu, gv,
+    box, root, keys, codes, found_codes, found_scores, state,
+):  # fmt: skip
+    """Best-first branch and bound over (theta, v, u); resumable, see ``grcsm.py`` for the arguments."""
+    n, first, top = options[0], options[1], options[2]
+    chunk, limit, slice_limit = options[3], options[4], options[5]
+    collect, floor_score, has_prior = options[6], options[7], options[8]
+    sums = np.empty(3, np.int64)
+    turns = np.empty(max(1, size[top, 2]), np.int64) if affine.shape[0] > 1 else np.empty(1, np.int64)
+    n_heap, cut, cut_code = state[HEAP], state[BEST], state[BEST_CODE]
+    evaluations, n_found = state[EVALUATIONS], state[FOUND]
+    started = evaluations
+    if collect:
+        cut, cut_code = floor_score - 1, np.int64(0)
+    diving = False
+    level, t, v, u, bound = np.int64(0), np.int64(0), np.int64(0), np.int64(0), np.int64(0)
+
+    if state[PHASE] == 0:
+        # every node of the first level, then a greedy dive from the best of them
+        nt, nv, nu = count[first, 2], count[first, 1], count[first, 0]
+        best_root, best_at = -(np.int64(1) << 60), np.int64(0)
+        for it in range(nt):
+            if first == 0:
+                ensure_cells(it, n, pu, pv, cosine, sine, start, cu, cv, have)
+                score_box(it * n, n, cu, cv, weight, chunk, lanes, 0, nv, 0, nu, box)
+            else:
+                middle = it * size[first, 2] + size[first, 2] // 2
+                ensure_cells(middle, n, pu, pv, cosine, sine, start, cu, cv, have)
+                slot = slots[first] + it
+                if list_counts[slot] < 0:
+                    merge_blocks(it, first, n, size, cu, cv, weight, classes, first, lists, list_counts, slot)
+                bound_box(slot, n, lists, list_counts, blocks, place[first], 0, nv, 0, nu, box)
+            for i in range(nv * nu):
+                value = box[i]
+                if has_prior:
+                    value += (
+                        prior[prior_at[first, 2] + it]
+                        + prior[prior_at[first, 1] + i // nu]
+                        + prior[prior_at[first, 0] + i % nu]
+                    )
+                root[it * nv * nu + i] = value
+                if value > best_root:
+                    best_root, best_at = value, it * nv * nu + i
+        evaluations += nt * nv * nu
+        state[PHASE] = 1
+        if first == 0:
+            for i in range(nt * nv * nu):
+                code = pack(i // (nv * nu), (i // nu) % nv, i % nu)
+                if collect:
+                    if root[i] > cut:
+                        if n_found < found_codes.shape[0]:
+                            found_codes[n_found], found_scores[n_found] = code, root[i]
+                        n_found += 1
+                elif keeps(root[i], code, cut, cut_code):
+                    cut, cut_code = root[i], code
+        elif best_root > cut:
+            diving = True
+            level, bound = first, best_root
+            t, v, u = best_at // (nv * nu), (best_at // nu) % nv, best_at % nu
+            root[best_at] = -(np.int64(1) << 60)
+
+    stop = DONE
+    while True:
+        if not diving:
+            if state[PHASE] == 1:
+                # the incumbent is known: queue what can still beat it
+                if first > 0:
+                    nt, nv, nu = count[first, 2], count[first, 1], count[first, 0]
+                    if keys.shape[0] < n_heap + nt * nv * nu:
+                        stop = HEAP_FULL
+                        break
+                    bu, bv, bt = size[first, 0], size[first, 1], size[first, 2]
+                    for it in range(nt):
+                        for i in range(nv * nu):
+                            value = root[it * nv * nu + i]
+                            if value < cut:
+                                continue
+                            code = pack(it * bt, (i // nu) * bv, (i % nu) * bu)
+                            if keeps(value, code, cut, cut_code):
+                                heap_push(keys, codes, n_heap, (value << 6) | (63 - first), code)
+                                n_heap += 1
+                state[PHASE] = 2
+            if n_heap == 0:
+                break
+            bound, code = keys[0] >> 6, codes[0]
+            if bound < cut:
+                n_heap = 0
+                break
+            if not keeps(bound, code, cut, cut_code):
+                heap_pop(keys, codes, n_heap)
+                n_heap -= 1
+                continue
+            if not collect and start[4] > 0.0 and bound - cut <= start[4] * cut:
+                stop = TOLERANCE
+                break
+            if evaluations >= limit:
+                stop = BUDGET
+                break
+            if evaluations - started >= slice_limit:
+                stop = BUDGET
+                break
+            level = 63 - (keys[0] & 63)
+            t = (code >> (2 * SHIFT_NODE)) // size[level, 2]
+            v = ((code >> SHIFT_NODE) & ((1 << SHIFT_NODE) - 1)) // size[level, 1]
+            u = (code & ((1 << SHIFT_NODE) - 1)) // size[level, 0]
+            bt, bv, bu = size[level, 2], size[level, 1], size[level, 0]
+            lt, lv, lu = size[level - 1, 2], size[level - 1, 1], size[level - 1, 0]
+            children = (bt // lt) * (bv // lv) * (bu // lu)
+            if keys.shape[0] < n_heap + children:
+                stop = HEAP_FULL
+                break
+            if collect and found_codes.shape[0] < n_found + children and level == 1:
+                stop = FOUND_FULL
+                break
+            heap_pop(keys, codes, n_heap)
+            n_heap -= 1
+        bt, bv, bu = size[level, 2], size[level, 1], size[level, 0]
+        lt, lv, lu = size[level - 1, 2], size[level - 1, 1], size[level - 1, 0]
+        ft, fv, fu = bt // lt, bv // lv, bu // lu
+        t0, v0, u0 = t * bt, v * bv, u * bu  # the node's first leaf
+        shift = affine_place[level, 4]
+        majorant = shift >= 0
+        if majorant:
+            middle = t0 + bt // 2
+            for i in range(t0, t0 + bt):
+                ensure_cells(i, n, pu, pv, cosine, sine, start, cu, cv, have)
+            flag = slots[level] + t
+            class_base = affine_place[level, 5] * n
+            if near_have[flag] == 0:
+                affine_classes(t, bt, n, cu, cv, class_of[level], near[class_base:])
+                near_have[flag] = 1
+            affine_pass(
+                middle * n, class_base + t * n, n, cu, cv, weight, u0 + bu // 2, v0 + bv // 2,
+                affine_place[level], affine, near, gu, gv, sums,
+            )  # fmt: skip
+            for i in range(bt):
+                if t0 + i == middle:
+                    turns[i] = 0
+                else:
+                    turns[i] = turn_gain(middle * n, (t0 + i) * n, n, cu, cv, gu, gv)
+        best_child, best_key = np.int64(-1), -(np.int64(1) << 60)
+        next_t, next_v, next_u = np.int64(0), np.int64(0), np.int64(0)
+        for a in range(ft):
+            ct = t0 // lt + a
+            turn = np.int64(0)
+            if majorant:
+                turn = turns[a * lt]
+                for i in range(1, lt):
+                    turn = max(turn, turns[a * lt + i])
+                evaluations += fv * fu
+                if level == 1:
+                    # is any leaf of this angle worth its score?
+                    worth = False
+                    for b in range(fv):
+                        for c in range(fu):
+                            value = sums[0] + turn + sums[2] * (b - bv // 2) + sums[1] * (c - bu // 2)
+                            value = value >> shift
+                            if has_prior:
+                                value += (
+                                    prior[prior_at[0, 2] + ct]
+                                    + prior[prior_at[0, 1] + v0 + b]
+                                    + prior[prior_at[0, 0] + u0 + c]
+                                )
+                            worth = worth or keeps(min(value, bound), pack(ct, v0 + b, u0 + c), cut, cut_code)
+                    if not worth:
+                        continue
+            elif level > 1:
+                middle = ct * lt + lt // 2
+                ensure_cells(middle, n, pu, pv, cosine, sine, start, cu, cv, have)
+                slot = slots[level - 1] + ct
+                if list_counts[slot] < 0:
+                    merge_blocks(
+                        ct, level - 1, n, size, cu, cv, weight, classes, level - 1, lists, list_counts, slot
+                    )
+                bound_box(
+                    slot, n, lists, list_counts, blocks, place[level - 1], v0 // lv, fv, u0 // lu, fu, box
+                )
+                evaluations += fv * fu
+            if level == 1:
+                ensure_cells(ct, n, pu, pv, cosine, sine, start, cu, cv, have)
+                score_box(ct * n, n, cu, cv, weight, chunk, lanes, v0, fv, u0, fu, box)
+                evaluations += fv * fu
+            for b in range(fv):
+                for c in range(fu):
+                    if majorant and level > 1:
+                        lo, hi = b * lv - bv // 2, (b + 1) * lv - 1 - bv // 2
+                        value = sums[0] + turn + max(sums[2] * lo, sums[2] * hi)
+                        lo, hi = c * lu - bu // 2, (c + 1) * lu - 1 - bu // 2
+                        value = (value + max(sums[1] * lo, sums[1] * hi)) >> shift
+                    else:
+                        value = box[b * fu + c]
+                    if has_prior:
+                        value += (
+                            prior[prior_at[level - 1, 2] + ct]
+                            + prior[prior_at[level - 1, 1] + v0 // lv + b]
+                            + prior[prior_at[level - 1, 0] + u0 // lu + c]
+                        )
+                    code = pack(ct * lt, v0 + b * lv, u0 + c * lu)
+                    if level == 1:
+                        if collect:
+                            if value > cut:
+                                found_codes[n_found], found_scores[n_found] = code, value
+                                n_found += 1
+                        elif keeps(value, code, cut, cut_code):
+                            cut, cut_code = value, code
+                        continue
+                    value = min(value, bound)
+                    if not keeps(value, code, cut, cut_code):
+                        continue
+                    if diving and value > best_key:
+                        if best_child >= 0:
+                            heap_push(keys, codes, n_heap, (best_key << 6) | (64 - level), best_child)
+                            n_heap += 1
+                        best_key, best_child = value, code
+                        next_t, next_v, next_u = ct, v0 // lv + b, u0 // lu + c
+                    else:
+                        heap_push(keys, codes, n_heap, (value << 6) | (64 - level), code)
+                        n_heap += 1
+        if diving:
+            diving = best_child >= 0
+            level, t, v, u, bound = level - 1, next_t, next_v, next_u, best_key
+    state[HEAP] = n_heap
+    state[EVALUATIONS] = evaluations
+    state[FOUND] = n_found
+    state[BOUND] = max(cut, keys[0] >> 6) if n_heap > 0 else cut
+    if not collect:
+        state[BEST], state[BEST_CODE] = cut, cut_code
+    return stop
+
+
+# ---------------------------------------------------------------- other matchers
+
+
+@jit
+def brute(n, pu, pv, weight, chunk, start, cosine, sine, count, lanes, prior, prior_at, has_prior, state):
+    """Score every pose of the window; the first of the best in (theta, v, u) order wins."""
+    nt, nv, nu = count[0, 2], count[0, 1], count[0, 0]
+    cu, cv = np.empty(n, np.int32), np.empty(n, np.int32)
+    box = np.empty(nu, np.int64)
+    one_cos, one_sin = np.empty(1, np.float64), np.empty(1, np.float64)
+    best, best_code = np.int64(-(1 << 60)), np.int64(0)
+    for t in range(nt):
+        one_cos[0], one_sin[0] = cosine[t], sine[t]
+        fill_cells(0, n, pu, pv, one_cos, one_sin, start, cu, cv)
+        for v in range(nv):
+            score_box(0, n, cu, cv, weight, chunk, lanes, v, 1, 0, nu, box)
+            for u in range(nu):
+                value = box[u]
+                if has_prior:
+                    value += prior[prior_at[0, 2] + t] + prior[prior_at[0, 1] + v] + prior[prior_at[0, 0] + u]
+                if value > best:
+                    best, best_code = value, pack(t, v, u)
+    state[BEST], state[BEST_CODE], state[BOUND] = best, best_code, best
+    state[EVALUATIONS] = nt * nv * nu
+
+
+@jit
+def printed(
+    n, pu, pv, weight, start, angle_first, angle_step, size, count, tables, places, keys, codes, limit, state
+):
+    """The search as the paper prints it: block maxima, one look-up a point at a block's centre (Eq. 3-5).
+
+    ``places`` (levels, 5): offset into ``tables``, rows, columns, lowest block in u and v. Not a bound:
+    it may stop at a pose that is not the best.
+    """
+    top = count.shape[0] - 1
+    level, t, v, u = top, np.int64(0), np.int64(0), np.int64(0)
+    n_heap, evaluations = state[HEAP], state[EVALUATIONS]
+    if evaluations > 0:
+        level = -1
+    while True:
+        if level < 0:
+            if n_heap == 0:
+                return DONE
+            if evaluations >= limit:
+                state[HEAP], state[EVALUATIONS], state[BOUND] = n_heap, evaluations, keys[0] >> 6
+                return BUDGET
+            level = 63 - (keys[0] & 63)
+            code = codes[0]
+            if level > 0:
+                worst = 1
+                for axis in range(3):
+                    worst *= size[level, axis] // size[level - 1, axis]
+                if keys.shape[0] < n_heap + worst:
+                    state[HEAP], state[EVALUATIONS] = n_heap, evaluations
+                    return HEAP_FULL
+            t = (code >> (2 * SHIFT_NODE)) // size[level, 2]
+            v = ((code >> SHIFT_NODE) & ((1 << SHIFT_NODE) - 1)) // size[level, 1]
+            u = (code & ((1 << SHIFT_NODE) - 1)) // size[level, 0]
+            if level == 0:
+                state[BEST], state[BEST_CODE], state[EVALUATIONS] = keys[0] >> 6, code, evaluations
+                state[HEAP], state[BOUND] = n_heap, keys[0] >> 6
+                return DONE
+            heap_pop(keys, codes, n_heap)
+            n_heap -= 1
+        lt, lv, lu = size[level - 1, 2], size[level - 1, 1], size[level - 1, 0]
+        ft, fv, fu = size[level, 2] // lt, size[level, 1] // lv, size[level, 0] // lu
+        where = places[level - 1]
+        rows, columns = where[1], where[2]
+        for a in range(ft):
+            ct = t * ft + a
+            angle = angle_first + angle_step * (ct * lt + 0.5 * (lt - 1))
+            c, s = np.cos(angle), np.sin(angle)
+            for b in range(fv):
+                for d in range(fu):
+                    mv, mu = v * fv + b, u * fu + d
+                    shift_u, shift_v = mu * lu + 0.5 * (lu - 1), mv * lv + 0.5 * (lv - 1)
+                    total = np.int64(0)
+                    for k in range(n):
+                        x = (
+                            int(np.floor((c * pu[k] - s * start[2] * pv[k] + start[0] + shift_u) / lu))
+                            - where[3]
+                        )
+                        y = (
+                            int(np.floor((s * start[3] * pu[k] + c * pv[k] + start[1] + shift_v) / lv))
+                            - where[4]
+                        )
+                        if 0 <= x < columns and 0 <= y < rows:
+                            total += np.int64(weight[k]) * np.int64(tables[where[0] + y * columns + x])
+                    heap_push(
+                        keys, codes, n_heap, (total << 6) | (64 - level), pack(ct * lt, mv * lv, mu * lu)
+                    )
+                    n_heap += 1
+        evaluations += ft * fv * fu
+        level = -1
+
+
+@jit
+def distances(points, edges, out):
+    """Distance of every point (n, 2) to the nearest edge (m, 2, 2)."""
+    for k in range(points.shape[0]):
+        least = np.inf
+        for e in range(edges.shape[0]):
+            du, dv = edges[e, 1, 0] - edges[e, 0, 0], edges[e, 1, 1] - edges[e, 0, 1]
+            pu, pv = points[k, 0] - edges[e, 0, 0], points[k, 1] - edges[e, 0, 1]
+            size = du * du + dv * dv
+            f = min(1.0, max(0.0, (pu * du + pv * dv) / size)) if size > 0.0 else 0.0
+            least = min(least, (pu - f * du) ** 2 + (pv - f * dv) ** 2)
+        out[k] = np.sqrt(least)

@@ -1,0 +1,189 @@
+"""Iterative closest point, the usual alternative: Open3D and small_gicp on clouds in the plane v = 0."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bimfit.config import SearchConfig
+from bimfit.geometry.pose import Array, Pose2D
+from bimfit.geometry.slice import Slice
+from bimfit.geometry.status import OK, Status
+from bimfit.registration.fitness import fitness_of
+from bimfit.registration.result import MatchResult
+from bimfit.registration.table import Target
+
+ITERATIONS = 100
+SPACING = 0.001  # between samples of the model, m
+GATE_SIGMAS = 3.0
+MIN_GATE = 0.03  # correspondences farther apart than this or three blurs are not made, m
+LOST = np.full(3, np.nan)
+Kind = Literal["point", "plane", "robust"]
+
+
+def icp_point(
+    target: Target, slice_: Slice, prior: Pose2D, config: SearchConfig, *, weights: ArrayLike | None = None
+) -> MatchResult:
+    """Point-to-point ICP (Open3D), started at the prior. ``config`` and ``weights`` are not used."""
+    return _open3d("icp-point", "point", target, slice_, (prior,))
+
+
+def icp_plane(
+    target: Target, slice_: Slice, prior: Pose2D, config: SearchConfig, *, weights: ArrayLike | None = None
+) -> MatchResult:
+    """Point-to-plane ICP (Open3D), started at the prior. ``config`` and ``weights`` are not used."""
+    return _open3d("icp-plane", "plane", target, slice_, (prior,))
+
+
+def icp_plane_robust(
+    target: Target, slice_: Slice, prior: Pose2D, config: SearchConfig, *, weights: ArrayLike | None = None
+) -> MatchResult:
+    """Point-to-plane ICP with a Tukey kernel of three blurs (Open3D)."""
+    return _open3d("icp-plane-robust", "robust", target, slice_, (prior,))
+
+
+def icp_multistart(
+    target: Target, slice_: Slice, prior: Pose2D, config: SearchConfig, *, weights: ArrayLike | None = None
+) -> MatchResult:
+    """Point-to-plane ICP from 27 starts spread over the window; the one with most inliers wins."""
+    steps = [(-0.5 * w, 0.0, 0.5 * w) for w in config.window]
+    pivot = np.mean(slice_.points, axis=0) if len(slice_.points) else np.zeros(2)
+    starts = tuple(Pose2D.about(pivot, *motion) @ prior for motion in itertools.product(*steps))
+    return _open3d("icp-multistart", "plane", target, slice_, starts)
+
+
+def g_icp(
+    target: Target, slice_: Slice, prior: Pose2D, config: SearchConfig, *, weights: ArrayLike | None = None
+) -> MatchResult:
+    """Generalised ICP (small_gicp) on the clouds repeated along the joint, so that normals exist."""
+    name = "g-icp"
+    if lost := _too_little(name, target, slice_):
+        return lost
+    try:
+        import small_gicp
+    except ImportError:
+        return MatchResult(name, LOST, status=Status("rejected", "small_gicp is not installed"))
+    model, _ = sample(target.edges)
+    started = time.perf_counter()
+    moved = prior.inverse().apply(slice_.points)
+    width = np.arange(-5, 6) * 0.002
+    try:
+        found = small_gicp.align(
+            _extruded(model, width), _extruded(moved, width), registration_type="GICP",
+            downsampling_resolution=0.0015, max_correspondence_distance=_gate(target),
+            max_iterations=ITERATIONS,
+        )  # fmt: skip
+    except Exception as error:  # a library's failure on this slice is a verdict, not a crash
+        return MatchResult(name, LOST, status=Status("rejected", f"small_gicp: {error}"))
+    matrix = np.asarray(found.T_target_source)
+    converged = bool(found.converged)
+    return _verdict(name, target, slice_, prior, matrix, int(found.iterations), converged, started)
+
+
+def sample(edges: Array, spacing: float = SPACING) -> tuple[Array, Array]:
+    """Points and unit normals along surface pieces, ``spacing`` (m) apart; shapes (n, 2)."""
+    points, normals = [], []
+    for a, b in edges:
+        d = b - a
+        length = float(np.hypot(d[0], d[1]))
+        steps = max(1, math.ceil(length / spacing))
+        points.append(a + d * ((np.arange(steps) + 0.5) / steps)[:, None])
+        normals.append(np.tile(np.array([d[1], -d[0]]) / max(length, 1e-300), (steps, 1)))
+    return np.concatenate(points), np.concatenate(normals)
+
+
+def _extruded(points: Array, width: Array) -> Array:
+    flat = np.repeat(points, len(width), axis=0)
+    return np.column_stack([flat, np.tile(width, len(points))])
+
+
+def _flat(points: Array) -> Array:
+    return np.column_stack([points, np.zeros(len(points))])
+
+
+def _gate(target: Target) -> float:
+    return max(MIN_GATE, GATE_SIGMAS * target.blur)
+
+
+def _too_little(name: str, target: Target, slice_: Slice) -> MatchResult | None:
+    if target.empty:
+        return MatchResult(name, LOST, status=Status("no_data", "no surface of the model is visible"))
+    if len(slice_.points) < 3:
+        return MatchResult(
+            name, LOST, status=Status("no_data", f"only {len(slice_.points)} points in the slice")
+        )
+    return None
+
+
+def _open3d(name: str, kind: Kind, target: Target, slice_: Slice, starts: tuple[Pose2D, ...]) -> MatchResult:
+    if lost := _too_little(name, target, slice_):
+        return lost
+    import open3d as o3d
+
+    registration = o3d.pipelines.registration
+    model = _cloud(o3d, target)
+    estimation: Any = {
+        "point": registration.TransformationEstimationPointToPoint,
+        "plane": registration.TransformationEstimationPointToPlane,
+        "robust": lambda: registration.TransformationEstimationPointToPlane(
+            registration.TukeyLoss(k=GATE_SIGMAS * target.blur)
+        ),
+    }[kind]()
+    criteria = registration.ICPConvergenceCriteria(max_iteration=ITERATIONS)
+    started = time.perf_counter()
+    best: MatchResult | None = None
+    for start in starts:
+        data = o3d.geometry.PointCloud(
+            o3d.utility.Vector3dVector(_flat(start.inverse().apply(slice_.points)))
+        )
+        try:
+            found = registration.registration_icp(data, model, _gate(target), np.eye(4), estimation, criteria)
+        except RuntimeError as error:
+            failed = MatchResult(name, LOST, status=Status("rejected", f"Open3D: {error}"))
+            best = best or failed
+            continue
+        matrix = np.asarray(found.transformation)
+        result = _verdict(name, target, slice_, start, matrix, len(starts), True, started)
+        if best is None or not best.found or (result.found and result.fitness > best.fitness):
+            best = result
+    assert best is not None
+    return best
+
+
+def _cloud(o3d: Any, target: Target) -> Any:
+    """The model as a cloud with normals; kept with the target's tables, as those of a search are."""
+    with target.lock:
+        cloud = target.kept.get("open3d")
+        if cloud is None:
+            points, normals = sample(target.edges)
+            cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(_flat(points)))
+            cloud.normals = o3d.utility.Vector3dVector(_flat(normals))
+            target.kept["open3d"] = cloud
+    return cloud
+
+
+def _verdict(
+    name: str, target: Target, slice_: Slice, start: Pose2D, matrix: Array, evaluations: int,
+    converged: bool, started: float,
+) -> MatchResult:  # fmt: skip
+    """What a motion of the data (4 x 4) means for the model."""
+    seconds = time.perf_counter() - started
+    if not np.all(np.isfinite(matrix)):
+        return MatchResult(name, LOST, status=Status("rejected", "the solution is not a number"))
+    motion = Pose2D(float(matrix[0, 3]), float(matrix[1, 3]), math.atan2(matrix[1, 0], matrix[0, 0]))
+    pose = start @ motion.inverse()
+    share, rmse = fitness_of(target, slice_.points, pose)
+    status = OK
+    if share == 0.0:
+        status = Status("rejected", "no point lies near the model")
+    elif not converged:
+        status = Status("weak", f"not converged within {ITERATIONS} iterations")
+    return MatchResult(
+        name, pose.as_array(), evaluations=evaluations, status=status, fitness=share, inlier_rmse=rmse,
+        seconds=seconds,
+    )  # fmt: skip

@@ -1,0 +1,306 @@
+"""Look-up tables of a model, and the target that keeps them."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bimfit.config import Bound
+from bimfit.errors import ConfigError
+from bimfit.geometry.pose import Array
+from bimfit.registration import _kernels
+from bimfit.registration.lattice import Integers, Lattice
+
+MAX_CELLS = 1 << 26
+MAX_CLASSES = 6  # slack classes (rings) a level
+AFFINE_REACH = 24  # beyond this many cells a slope gains nothing over a plain maximum
+BLUR_REACH = math.sqrt(2.0 * math.log(2.0 * _kernels.FULL)) * 1.0001  # in sigma: farther, a cell holds 0
+
+
+@dataclass(frozen=True)
+class Tables:
+    """Everything that a search reads about the model, for one lattice.
+
+    Attributes
+    ----------
+    lattice : Lattice
+    bound : {"majorant", "overlap", "block"}
+    origin : ndarray, shape (2,)
+        Outer corner of cell (0, 0), m, in the model's frame.
+    leaf : ndarray of uint8, shape (rows, columns)
+        255 times the blurred surface; row = v, column = u; 0 outside.
+    lanes : ndarray of uint64
+        ``leaf`` with three neighbours a word, for the kernels.
+    blocks, block_place : ndarray
+        Block maxima, flat, and where each level's and class's lie.
+    affine, affine_place : ndarray
+        Affine majorants, flat, and where each level's lie.
+    class_of : ndarray of uint8, shape (levels, slacks)
+        Slack class that serves so many cells of slack.
+    reach : float
+        Largest distance of a point from the pivot that the classes cover, m.
+    cosine, sine : ndarray
+        Of the lattice's angles.
+    seconds : float
+        What building took.
+    """
+
+    lattice: Lattice
+    bound: Bound
+    origin: Array
+    leaf: NDArray[np.uint8]
+    lanes: NDArray[np.uint64]
+    blocks: NDArray[np.uint8]
+    block_place: Integers
+    affine: NDArray[np.uint32]
+    affine_place: Integers
+    class_of: NDArray[np.uint8]
+    reach: float
+    cosine: Array
+    sine: Array
+    seconds: float
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all tables, bytes."""
+        parts = (self.leaf, self.lanes, self.blocks, self.affine, self.class_of, self.cosine, self.sine)
+        return int(sum(part.nbytes for part in parts))
+
+
+def build_tables(edges: Array, blur: float, lattice: Lattice, bound: Bound, reach: float) -> Tables:
+    """Rasterise, blur and take the bounds of every level.
+
+    Parameters
+    ----------
+    edges : ndarray, shape (n, 2, 2)
+        Surface pieces, m.
+    blur : float
+        Standard deviation of the radial Gaussian, m.
+    lattice : Lattice
+    bound : {"majorant", "overlap", "block"}
+        Which bounds to prepare.
+    reach : float
+        Largest distance of a point from the pivot to provide for, m.
+
+    Raises
+    ------
+    ConfigError
+        When the model is too large for its cells.
+    """
+    started = time.perf_counter()
+    cell = np.array(lattice.step[:2])
+    leaf, origin = _leaf(edges, blur, cell, np.array(lattice.half[:2]))
+    class_of = _classes(lattice, float(cell.min()), reach)
+    majorant = _majorant_levels(lattice, blur / float(cell.max())) if bound == "majorant" else ()
+    if bound == "block":
+        blocks, block_place = _printed_blocks(leaf, origin, lattice)
+    else:
+        blocks, block_place = _overlapped_blocks(leaf, lattice, class_of)
+    affine, affine_place = _affine(leaf, lattice, class_of, majorant, blur / float(cell.min()))
+    angles = lattice.angles
+    return Tables(
+        lattice, bound, origin, leaf, _kernels.lane_table(leaf), blocks, block_place, affine, affine_place,
+        class_of, reach, np.cos(angles), np.sin(angles), time.perf_counter() - started,
+    )  # fmt: skip
+
+
+def _leaf(edges: Array, blur: float, cell: Array, half: Array) -> tuple[NDArray[np.uint8], Array]:
+    margin = BLUR_REACH * blur + cell
+    low, high = edges.min(axis=(0, 1)) - margin, edges.max(axis=(0, 1)) + margin
+    # whole cells from the window's low corner, so that every table of a lattice shares its grid
+    origin = -half + np.floor((low + half) / cell) * cell
+    width, height = (int(x) for x in np.ceil((high - origin) / cell))
+    if width * height > MAX_CELLS:
+        raise ConfigError(
+            f"a look-up table of {width} x {height} cells is too large",
+            remedy="loosen the tolerance or shorten the reach of the cross-section",
+        )
+    table = _kernels.raster(
+        np.ascontiguousarray(edges, np.float64), blur, origin[0], origin[1], cell[0], cell[1], height, width
+    )
+    return table, origin
+
+
+def _classes(lattice: Lattice, cell: float, reach: float) -> NDArray[np.uint8]:
+    """Which of at most six slack classes serves how many cells of slack, per level."""
+    slacks = _slacks(lattice, cell, reach)
+    longest = max(int(s[-1]) for s in slacks)
+    out = np.zeros((len(slacks), longest + 1), np.uint8)
+    for level, levels in enumerate(slacks):
+        out[level] = np.minimum(np.searchsorted(levels, np.arange(longest + 1)), len(levels) - 1)
+    return out
+
+
+def _slacks(lattice: Lattice, cell: float, reach: float) -> list[Integers]:
+    out = []
+    for eta in lattice.half_angle:
+        most = math.ceil(2.0 * reach * math.sin(0.5 * min(eta, math.pi)) / cell + 1e-9) if eta > 0.0 else 0
+        if most < MAX_CLASSES:
+            out.append(np.arange(most + 1))
+        else:
+            out.append(
+                np.unique(np.ceil(most * np.arange(1, MAX_CLASSES + 1) / MAX_CLASSES).astype(np.int64))
+            )
+    return out
+
+
+def _class_slack(class_of: NDArray[np.uint8], level: int) -> list[int]:
+    """Cells of slack that each class of a level provides for."""
+    row = class_of[level]
+    return [int(np.flatnonzero(row == c)[-1]) for c in range(int(row.max()) + 1)]
+
+
+def _majorant_levels(lattice: Lattice, sigma: float) -> tuple[int, ...]:
+    """Levels whose nodes are split by affine majorants: while a block stays within the blur."""
+    out = []
+    for level in range(1, lattice.top + 1):
+        widest = int(lattice.size[level, :2].max())
+        if level == 1 or widest <= 2.0 * sigma:
+            out.append(level)
+    return tuple(out)
+
+
+def _overlapped_blocks(
+    leaf: NDArray[np.uint8], lattice: Lattice, class_of: NDArray[np.uint8]
+) -> tuple[NDArray[np.uint8], Integers]:
+    height, width = leaf.shape
+    place = np.zeros((lattice.top + 1, MAX_CLASSES, 5), np.int64)
+    parts: list[NDArray[np.uint8]] = []
+    offset = 0
+    for level in range(1, lattice.top + 1):
+        bu, bv = int(lattice.size[level, 0]), int(lattice.size[level, 1])
+        for c, slack in enumerate(_class_slack(class_of, level)):
+            low_u, low_v = -((2 * bu - 2 + slack) // bu), -((2 * bv - 2 + slack) // bv)
+            columns = (width - 1 + slack) // bu - low_u + 1
+            rows = (height - 1 + slack) // bv - low_v + 1
+            out = np.zeros((rows, columns), np.uint8)
+            _kernels.block_table(leaf, bu, bv, slack, low_u, low_v, out)
+            place[level, c] = offset, rows, columns, low_u, low_v
+            parts.append(out.ravel())
+            offset += out.size
+    return (np.concatenate(parts) if parts else np.zeros(1, np.uint8)), place
+
+
+def _printed_blocks(
+    leaf: NDArray[np.uint8], origin: Array, lattice: Lattice
+) -> tuple[NDArray[np.uint8], Integers]:
+    """Block maxima of s^h cells, aligned with the window (Eq. 3 to 5); level 0 is the leaf table."""
+    height, width = leaf.shape
+    shift = np.rint((origin + np.array(lattice.half[:2])) / np.array(lattice.step[:2])).astype(np.int64)
+    place = np.zeros((lattice.top + 1, 5), np.int64)
+    parts: list[NDArray[np.uint8]] = []
+    offset = 0
+    for level in range(lattice.top + 1):
+        bu, bv = int(lattice.size[level, 0]), int(lattice.size[level, 1])
+        low_u, low_v = int(shift[0]) // bu, int(shift[1]) // bv
+        rows = (int(shift[1]) + height - 1) // bv - low_v + 1
+        columns = (int(shift[0]) + width - 1) // bu - low_u + 1
+        padded = np.zeros((rows * bv, columns * bu), np.uint8)
+        i, j = int(shift[1]) - low_v * bv, int(shift[0]) - low_u * bu
+        padded[i : i + height, j : j + width] = leaf
+        out = padded.reshape(rows, bv, columns, bu).max(axis=(1, 3))
+        place[level] = offset, rows, columns, low_u, low_v
+        parts.append(out.ravel())
+        offset += out.size
+    return np.concatenate(parts), place
+
+
+def _affine(
+    leaf: NDArray[np.uint8],
+    lattice: Lattice,
+    class_of: NDArray[np.uint8],
+    levels: tuple[int, ...],
+    sigma: float,
+) -> tuple[NDArray[np.uint32], Integers]:
+    height, width = leaf.shape
+    place = np.full((lattice.top + 1, 6), -1, np.int64)
+    parts: list[NDArray[np.uint32]] = []
+    offset, angles = 0, 0
+    # steepest slope of a Gaussian: 255 exp(-1/2) / sigma a cell, to be held in 7 bits and a sign
+    shift = int(np.clip(math.floor(math.log2(127.0 * sigma / (_kernels.FULL * math.exp(-0.5)))), 0, 5))
+    for level in levels:
+        slacks = _class_slack(class_of, level)
+        ru, rv = int(lattice.size[level, 0]) // 2, int(lattice.size[level, 1]) // 2
+        pad = max(ru, rv) + slacks[-1] + 1
+        rows, columns = height + 2 * pad, width + 2 * pad
+        place[level] = offset, rows, columns, pad, shift, angles
+        angles += int(lattice.nodes[level, 2])
+        for slack in slacks:
+            out = np.empty((rows, columns), np.uint32)
+            if max(ru, rv) + slack <= AFFINE_REACH:
+                _kernels.affine_table(leaf, ru + slack, rv + slack, pad, shift, out)
+            else:
+                out[:] = _flat(leaf, ru + slack, rv + slack, pad, shift)
+            parts.append(out.ravel())
+            offset += out.size
+    return (np.concatenate(parts) if parts else np.zeros(1, np.uint32)), place
+
+
+def _flat(leaf: NDArray[np.uint8], ru: int, rv: int, pad: int, shift: int) -> NDArray[np.uint32]:
+    """Majorants of slope 0: the plain maximum."""
+    from scipy.ndimage import maximum_filter
+
+    padded = np.pad(leaf, pad)
+    top = maximum_filter(padded, size=(2 * rv + 1, 2 * ru + 1), mode="constant")
+    return (top.astype(np.uint32) << np.uint32(shift)) | np.uint32((128 << 16) | (128 << 24))
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A model prepared for matching: its visible surface, its blur, and tables built once for each lattice.
+
+    Attributes
+    ----------
+    edges : ndarray, shape (n, 2, 2)
+        Visible surface pieces in the section frame, m (``geometry.visibility.visible_edges``), or all
+        edges for the paper's closed outlines.
+    blur : float
+        Standard deviation of the radial Gaussian about the surface, m.
+    kept : dict
+        Tables built so far, by lattice and bound; guarded by ``lock``.
+    """
+
+    edges: Array
+    blur: float
+    kept: dict[Any, Any] = field(default_factory=dict, repr=False)
+    lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
+
+    @classmethod
+    def of(cls, edges: ArrayLike, blur: float) -> Target:
+        """Make a target from anything array-like.
+
+        Raises
+        ------
+        ConfigError
+            When the blur is not positive or a coordinate is not a number.
+        """
+        pieces = np.ascontiguousarray(np.asarray(edges, np.float64).reshape(-1, 2, 2))
+        if not (math.isfinite(blur) and blur > 0.0):
+            raise ConfigError(f"blur must be a positive number, got {blur}")
+        if not np.all(np.isfinite(pieces)):
+            raise ConfigError("the model's edges hold a coordinate that is not a number")
+        return cls(pieces, float(blur))
+
+    @property
+    def empty(self) -> bool:
+        """Whether no surface is visible at all."""
+        return len(self.edges) == 0
+
+    def tables(self, lattice: Lattice, bound: Bound, reach: float) -> Tables:
+        """Tables for a lattice and for points up to ``reach`` (m) from the pivot; built once and kept."""
+        key = (lattice, bound)
+        found: Tables | None = self.kept.get(key)
+        if found is not None and found.reach >= reach:
+            return found
+        with self.lock:
+            found = self.kept.get(key)
+            if found is None or found.reach < reach:
+                found = build_tables(self.edges, self.blur, lattice, bound, 1.25 * reach)
+                self.kept[key] = found
+        return found
