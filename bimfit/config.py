@@ -203,7 +203,8 @@ class JointConfig:
         Shortest joint, m.
     classes : tuple of str
         IFC classes to look at, subclasses that begin with the same name included (IfcWall: also
-        IfcWallStandardCase); empty: every building element but openings, spaces, doors, windows and furniture.
+        IfcWallStandardCase); empty: every building element but openings, spaces, doors, windows and
+        furniture.
     storeys : tuple of str
         Names of the storeys to look at; empty: all.
     min_gap : float or None

@@ -35,7 +35,7 @@ def cache_path(digest: str) -> Path:
 
 
 def load_cached(digest: str) -> tuple[dict[str, Any], dict[int, TriangleMesh]] | None:
-    """Description and meshes (step id -> mesh) of a model kept before; None when there is none or it is damaged."""
+    """Description and meshes (by step id) of a model kept before; None without one or if it is damaged."""
     path = cache_path(digest)
     try:
         with np.load(path, allow_pickle=False) as arrays:

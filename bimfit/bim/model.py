@@ -118,7 +118,7 @@ class Model:
 
 
 def element_from_mesh(mesh: TriangleMesh, name: str, guid: str | None = None) -> Element:
-    """Let a mesh in world metres stand in for an IFC element; without a ``guid`` it gets one from its name and shape."""
+    """Let a mesh in world metres stand in for an IFC element; its GlobalId follows from name and shape."""
     if guid is None:
         hashed = hashlib.sha256(name.encode() + mesh.vertices.tobytes() + mesh.faces.tobytes())
         guid = _ifc_guid(hashed.digest()[:16])
@@ -213,7 +213,7 @@ def _assemble(source: Source, about: dict[str, Any], meshes: dict[int, TriangleM
 
 def _why_bare(index: dict[str, Any], skipped: list[Skipped]) -> str:
     if skipped:
-        return f"none of its {len(skipped)} elements has geometry that could be read: the first {skipped[0].reason}"
+        return f"none of its {len(skipped)} elements has readable geometry: the first {skipped[0].reason}"
     if index.get("bare"):
         return f"has no geometry: none of its {index['bare']} elements has a representation"
     return "holds no building element with geometry"
@@ -225,11 +225,9 @@ def _odd_unit(elements: Sequence[Element]) -> list[str]:
     middle = float(np.median(sizes))
     low, high = _ODD_SIZES
     if middle > high:
-        return [
-            f"half of the elements measure more than {middle:.0f} m: is its length unit millimetre, not metre?"
-        ]
+        return [f"half of its elements measure more than {middle:.0f} m: is its unit millimetre, not metre?"]
     if middle < low:
-        return [f"half of the elements measure less than {middle * 1e3:.2g} mm: is its length unit metre?"]
+        return [f"half of its elements measure less than {middle * 1e3:.2g} mm: is its unit metre?"]
     return []
 
 

@@ -1,8 +1,8 @@
 """The child process that opens an IFC and tessellates it: ``python -m bimfit.bim.tessellate``.
 
 It reads a request (JSON) from standard input and writes messages to standard output. A message is a line
-of JSON, followed by ``bytes`` bytes of arrays. If the geometry kernel crashes or hangs, this process ends and the
-one that started it goes on (:mod:`bimfit.bim.loading`).
+of JSON, followed by ``bytes`` bytes of arrays. If the geometry kernel crashes or hangs, this process ends and
+the one that started it goes on (:mod:`bimfit.bim.loading`).
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ def _outward(vertices: Array, faces: Any) -> Any:
 
 
 def _products(model: Any, include: list[str] | None) -> dict[int, Any]:
-    """Step id -> element with a representation, sorted by id; elements taken apart give way to their parts."""
+    """Step id -> element with a representation, by id; elements taken apart give way to their parts."""
     parents, _ = _relations(model)
     found = {e.id(): e for kind in ("IfcElement", "IfcProxy") for e in _by_type(model, kind)}
     found = {i: e for i, e in found.items() if not any(e.is_a(kind) for kind in _NO_ELEMENTS)}
@@ -302,7 +302,7 @@ def _georeference(model: Any) -> tuple[dict[str, Any] | None, list[str]]:
 
 
 def _default_map_unit(values: dict[str, Any], project_unit: float) -> float:
-    """Without a map unit the project's counts, but eastings that would be metres from the grid's origin are metres."""
+    """Without a map unit the project's counts, unless eastings in it would be next to the grid's origin."""
     size = max(abs(values.get("Eastings") or 0.0), abs(values.get("Northings") or 0.0))
     return 1.0 if size * project_unit < 10_000.0 <= size else project_unit
 

@@ -1,0 +1,203 @@
+"""Fourth stage of the joint finder: what lies between two facing faces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bimfit.bim.broad import box_pairs
+from bimfit.bim.faces import Faces, Index, ranges
+from bimfit.bim.narrow import PairFrames
+from bimfit.bim.strips import Strips, piece_centroids
+from bimfit.geometry.pose import Array
+
+TOUCH = 1e-3
+CLASH = -1.5e-3
+_SAMPLES = 15
+_CLEAR_SHARE = 0.8
+_INSIDE = 1e-4
+_OWN = 3e-4
+_END = 1e-3
+_ROWS = 1_000_000
+
+
+@dataclass(frozen=True)
+class Clearance:
+    """The verdict on each strip.
+
+    Attributes
+    ----------
+    state : ndarray of str, shape (n,)
+        ``open``, ``touch``, ``clash``, ``filled``, or ``own`` where one of the two lies in the way itself.
+    filler : ndarray, shape (n,)
+        Element in the gap, or -1.
+    """
+
+    state: NDArray[np.str_]
+    filler: Index
+
+
+def judge(faces: Faces, frames: PairFrames, strips: Strips) -> Clearance:
+    """Tell clearances, contacts, overlaps and filled gaps apart.
+
+    Up to 15 points a strip; at each the whole way from A to B is looked at, ends included, since a filler may
+    take up the whole gap.
+    """
+    n = len(strips.pair)
+    state = np.where(np.abs(strips.gap) <= TOUCH, "touch", "open").astype("<U6")
+    state[strips.gap_min < CLASH] = "clash"
+    filler = np.full(n, -1, np.int64)
+    tested = np.flatnonzero(state != "touch")
+    if not len(tested):
+        return Clearance(state, filler)
+    strip, point, weight = _samples(strips, tested)
+    pair = strips.pair[strip]
+    low, high = (h[:, 0] for h in frames.heights(pair, point[:, None, :]))
+    start = frames.lift(pair, point, low)
+    sample, element, own = _hits(faces, frames, pair, start, high - low, strip)
+    total = np.bincount(strip, weight, n)
+    blocked = np.unique(sample[own])
+    own_share = np.bincount(strip[blocked], weight[blocked], n) / np.maximum(total, 1e-300)
+    other = np.unique(np.stack([sample[~own], element[~own]]), axis=1)
+    shut = np.unique(other[0])
+    shut_share = np.bincount(strip[shut], weight[shut], n) / np.maximum(total, 1e-300)
+    clear = 1.0 - _CLEAR_SHARE
+    filled = (shut_share > clear) & (state == "open")
+    state[filled] = "filled"
+    state[own_share > clear] = "own"
+    rows = np.flatnonzero(filled[strip[other[0]]])
+    if len(rows):
+        keys = strip[other[0, rows]] * np.int64(len(faces.starts)) + other[1, rows]
+        unique, inverse = np.unique(keys, return_inverse=True)
+        votes = np.bincount(inverse, weight[other[0, rows]])
+        order = np.argsort(votes, kind="stable")
+        filler[unique[order] // len(faces.starts)] = unique[order] % len(faces.starts)
+    return Clearance(state, filler)
+
+
+def _samples(strips: Strips, tested: Index) -> tuple[Index, Array, Array]:
+    """Points spread over the strips: (strip, point (k, 2), weight)."""
+    chosen = strips.take(tested)
+    pieces = chosen.pieces
+    strip = np.repeat(tested, np.diff(chosen.splits))
+    middle = piece_centroids(pieces)
+    halfway = 0.5 * (middle[:, None] + pieces.corners)
+    points = np.concatenate([middle[:, None], halfway], axis=1)
+    real = np.concatenate(
+        [np.ones((len(strip), 1), bool), np.arange(pieces.corners.shape[1]) < pieces.count[:, None]], axis=1
+    )
+    row, column = np.nonzero(real)
+    owner = strip[row]
+    share = pieces.area[row] / (pieces.count[row] + 1)
+    heads = np.flatnonzero(np.diff(owner, prepend=-1))
+    sizes = np.diff(np.append(heads, len(owner)))
+    rank = np.arange(len(owner)) - np.repeat(heads, sizes)
+    count = np.repeat(sizes, sizes)
+    few = np.minimum(count, _SAMPLES)
+    keep = (rank * few) // count != ((rank - 1) * few) // count
+    return owner[keep], points[row, column][keep], share[keep]
+
+
+def _hits(
+    faces: Faces, frames: PairFrames, pair: Index, start: Array, reach: Array, strip: Index
+) -> tuple[Index, Index, NDArray[np.bool_]]:
+    """What the ways from A to B meet: (sample, element, whether it is A or B itself)."""
+    way = frames.m[pair]
+    end = start + reach[:, None] * way
+    heads = np.flatnonzero(np.diff(strip, prepend=-1))
+    low = np.minimum.reduceat(np.minimum(start, end), heads) - 2.0 * _END
+    high = np.maximum.reduceat(np.maximum(start, end), heads) + 2.0 * _END
+    sizes = np.diff(np.append(heads, len(strip)))
+    group, triangle = nearby_triangles(faces, low, high)
+    found: list[tuple[Index, Index, NDArray[np.bool_]]] = []
+    costs = np.cumsum(sizes[group])
+    position = 0
+    while position < len(group):
+        spent = int(costs[position - 1]) if position else 0
+        stop = max(position + 1, int(np.searchsorted(costs, spent + _ROWS, side="right")))
+        g, t = group[position:stop], triangle[position:stop]
+        sample = ranges(heads[g], sizes[g])
+        tri = np.repeat(t, sizes[g])
+        distance = ray_distance(start[sample], way[sample], faces.triangles[tri])
+        hit = np.flatnonzero(np.isfinite(distance))
+        sample, tri, distance = sample[hit], tri[hit], distance[hit]
+        near, far = np.minimum(0.0, reach[sample]), np.maximum(0.0, reach[sample])
+        owner = faces.owner[tri]
+        mine = (owner == faces.element[frames.a[pair[sample]]]) | (
+            owner == faces.element[frames.b[pair[sample]]]
+        )
+        corners = faces.triangles[tri]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        cosine = np.einsum("ij,ij->i", normal, way[sample]) / np.maximum(
+            np.linalg.norm(normal, axis=1), 1e-300
+        )
+        inside = (distance > near + _INSIDE) & (distance < far - _INSIDE)
+        # a filler that fits exactly: it begins where A ends, or ends where B begins
+        begins = (np.abs(distance - near) <= _END) & (cosine < -0.5)
+        ends = (np.abs(distance - far) <= _END) & (cosine > 0.5)
+        own = mine & (distance > near + _OWN) & (distance < far - _OWN)
+        keep = own | (~mine & (inside | begins | ends))
+        found.append((sample[keep], owner[keep], own[keep]))
+        position = stop
+    if not found:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, bool)
+    return (
+        np.concatenate([f[0] for f in found]),
+        np.concatenate([f[1] for f in found]),
+        np.concatenate([f[2] for f in found]),
+    )
+
+
+def nearby_triangles(faces: Faces, low: Array, high: Array) -> tuple[Index, Index]:
+    """Triangles whose boxes overlap given boxes (k, 3): (box, triangle), sorted by box."""
+    element_low, element_high = element_boxes(faces)
+    box, element = box_pairs(low, high, element_low, element_high)
+    order = np.lexsort((element, box))
+    box, element = box[order], element[order]
+    sizes = np.diff(faces.starts)[element]
+    out_box: list[Index] = []
+    out_triangle: list[Index] = []
+    costs = np.cumsum(sizes)
+    position = 0
+    while position < len(box):
+        spent = int(costs[position - 1]) if position else 0
+        stop = max(position + 1, int(np.searchsorted(costs, spent + _ROWS, side="right")))
+        some = slice(position, stop)
+        b = np.repeat(box[some], sizes[some])
+        t = ranges(faces.starts[element[some]], sizes[some])
+        near = np.all(faces.triangle_low[t] <= high[b], axis=1) & np.all(
+            faces.triangle_high[t] >= low[b], axis=1
+        )
+        out_box.append(b[near])
+        out_triangle.append(t[near])
+        position = stop
+    if not out_box:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    return np.concatenate(out_box), np.concatenate(out_triangle)
+
+
+def element_boxes(faces: Faces) -> tuple[Array, Array]:
+    """Least and greatest corners of the elements, shape (elements, 3) each."""
+    heads = faces.starts[:-1]
+    return np.minimum.reduceat(faces.triangle_low, heads), np.maximum.reduceat(faces.triangle_high, heads)
+
+
+def ray_distance(start: Array, way: Array, triangles: Array) -> Array:
+    """Distances (n,) along unit ways to triangles (n, 3, 3), negative behind; inf where they miss.
+
+    Moeller and Trumbore, "Fast, minimum storage ray/triangle intersection" (1997).
+    """
+    origin = triangles[:, 0]
+    e1, e2 = triangles[:, 1] - origin, triangles[:, 2] - origin
+    h = np.cross(way, e2)
+    det = np.einsum("ij,ij->i", e1, h)
+    flat = np.abs(det) < 1e-14
+    inverse = 1.0 / np.where(flat, 1.0, det)
+    s = start - origin
+    u = np.einsum("ij,ij->i", s, h) * inverse
+    q = np.cross(s, e1)
+    v = np.einsum("ij,ij->i", way, q) * inverse
+    hit = ~flat & (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1.0 + 1e-9)
+    return np.where(hit, np.einsum("ij,ij->i", e2, q) * inverse, np.inf)

@@ -1,0 +1,263 @@
+"""Runs the finder's stages on a set of elements, up to legs with a kind and a mouth."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bimfit.bim.bands import middle_line
+from bimfit.bim.broad import face_pairs
+from bimfit.bim.clearance import judge
+from bimfit.bim.faces import Faces, Index, find_faces
+from bimfit.bim.kind import Stations, classify, free_sides
+from bimfit.bim.merge import Leg, merge
+from bimfit.bim.narrow import PairFrames, facing_pieces, pair_frames
+from bimfit.bim.strips import Strips, find_strips
+from bimfit.geometry.mesh import TriangleMesh
+from bimfit.geometry.path import JointPath
+from bimfit.geometry.pose import Array
+
+_PARALLEL = math.radians(10.0)
+_GROOVE = math.radians(100.0)
+_GROOVE_FACE = 0.1
+_GROOVE_ROOT = 0.02
+_FULL = 0.9
+_BAND_DEPTH = 0.5
+_MID = 0.4871  # off the middle, where meshes tend to have vertices
+_SHARES = np.array([1.0 / 6.0, _MID, 5.0 / 6.0])
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What counts as two faces that meet: metres, m^2 and radians."""
+
+    max_gap: float = 0.06
+    max_overlap: float = 0.03
+    max_angle: float = _PARALLEL
+    min_area: float = 1e-4
+    min_diagonal: float = 0.02
+    min_length: float = 0.1
+    min_depth: float = 0.0025
+    grooves: bool = True
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A joint between two elements, by number, in world coordinates."""
+
+    a: int
+    b: int
+    state: str
+    filler: int
+    kind: str
+    leg: Leg
+    path: JointPath
+    free: tuple[bool, bool]
+
+
+def find_drafts(meshes: Sequence[TriangleMesh], eligible: NDArray[np.bool_], limits: Limits) -> list[Draft]:
+    """Find where eligible elements meet; the others only stand in the way."""
+    if len(meshes) < 2:
+        return []
+    faces = find_faces(meshes, min_area=limits.min_area, min_diagonal=limits.min_diagonal)
+    a, b = face_pairs(
+        faces,
+        max_gap=limits.max_gap,
+        max_overlap=limits.max_overlap,
+        min_cosine=math.cos(limits.max_angle),
+        max_cosine=1.1,
+        eligible=eligible,
+    )
+    frames = pair_frames(faces, a, b)
+    found = _strips(faces, frames, limits, -limits.max_overlap)
+    groups = _legs(faces, frames, found, limits)
+    if limits.grooves:
+        _add_grooves(faces, eligible, limits, groups)
+    rows = [(key, leg) for key in sorted(groups) for leg in merge(groups[key])]
+    rows = [
+        (key, leg) for key, leg in rows if leg.length >= limits.min_length and leg.depth >= limits.min_depth
+    ]
+    return _finish(faces, rows) if rows else []
+
+
+Key = tuple[int, int, str, int]
+
+
+def _strips(faces: Faces, frames: PairFrames, limits: Limits, least_gap: float) -> Strips:
+    pieces = facing_pieces(faces, frames, least_gap=least_gap, max_gap=limits.max_gap)
+    strips = find_strips(frames, pieces)
+    thin = (strips.depth < min(limits.min_depth, 0.002)) | (strips.length < limits.min_diagonal)
+    return strips.take(np.flatnonzero(~thin & (strips.area >= 0.5 * limits.min_area)))
+
+
+def _legs(faces: Faces, frames: PairFrames, strips: Strips, limits: Limits) -> dict[Key, list[Leg]]:
+    verdict = judge(faces, frames, strips)
+    kept = np.flatnonzero(verdict.state != "own")
+    strips, state, filler = strips.take(kept), verdict.state[kept], verdict.filler[kept]
+    half = 0.5 * strips.length[:, None] * strips.axis
+    ends = [_mid_gap(frames, strips.pair, strips.centre + sign * half) for sign in (-1.0, 1.0)]
+    m = frames.m[strips.pair]
+    element_a, element_b = faces.element[frames.a[strips.pair]], faces.element[frames.b[strips.pair]]
+    full = strips.area >= _FULL * strips.length * strips.depth
+    groups: dict[Key, list[Leg]] = defaultdict(list)
+    for k in range(len(strips.pair)):
+        key = (int(element_a[k]), int(element_b[k]), str(state[k]), int(filler[k]))
+        points, u, depth, length, closed = (
+            np.stack([ends[0][k], ends[1][k]]),
+            m[k : k + 1],
+            float(strips.depth[k]),
+            float(strips.length[k]),
+            False,
+        )
+        band = None if full[k] else _band(strips, k)
+        if band is not None:
+            line, closed = band
+            pair = np.full(len(line), strips.pair[k])
+            points, u = _mid_gap(frames, pair, line), np.repeat(u, len(line) - 1, axis=0)
+            length = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
+            depth = float(strips.area[k]) / length
+        groups[key].append(
+            Leg(
+                points=points,
+                u=u,
+                length=length,
+                depth=depth,
+                gap=float(strips.gap[k]),
+                low=float(strips.gap_min[k]),
+                high=float(strips.gap_max[k]),
+                area=float(strips.area[k]),
+                closed=closed,
+            )
+        )
+    return groups
+
+
+def _mid_gap(frames: PairFrames, pair: Index, points: Array) -> Array:
+    low, high = frames.heights(pair, points[:, None, :])
+    return frames.lift(pair, points, 0.5 * (low + high)[:, 0])
+
+
+def _band(strips: Strips, k: int) -> tuple[Array, bool] | None:
+    rows = slice(int(strips.splits[k]), int(strips.splits[k + 1]))
+    pieces = zip(strips.pieces.corners[rows], strips.pieces.count[rows], strict=True)
+    return middle_line([corners[:count] for corners, count in pieces], max_depth=_BAND_DEPTH)
+
+
+def _add_grooves(
+    faces: Faces, eligible: NDArray[np.bool_], limits: Limits, groups: dict[Key, list[Leg]]
+) -> None:
+    """Grooves without a root land: slim faces at a wide angle, of elements of which nothing else meets."""
+    diagonal = np.linalg.norm(faces.high - faces.low, axis=1)
+    slim = (faces.area < _GROOVE_FACE * diagonal) & (faces.area < diagonal**2 / 3.0)
+    a, b = face_pairs(
+        faces,
+        max_gap=limits.max_gap,
+        max_overlap=0.0,
+        min_cosine=math.cos(max(_GROOVE, limits.max_angle)),
+        max_cosine=math.cos(limits.max_angle),
+        eligible=eligible,
+    )
+    count = len(faces.starts)
+    taken = np.unique([key[0] * count + key[1] for key in groups]) if groups else np.zeros(0, np.int64)
+    fresh = ~np.isin(faces.element[a] * count + faces.element[b], taken) & slim[a] & slim[b]
+    if not fresh.any():
+        return
+    frames = pair_frames(faces, a[fresh], b[fresh])
+    strips = _strips(faces, frames, limits, -1e-3)
+    strips = strips.take(
+        np.flatnonzero((strips.gap_min <= _GROOVE_ROOT) & (strips.depth >= limits.min_depth))
+    )
+    for key, legs in _legs(faces, frames, strips, limits).items():
+        groups[key].extend(legs)
+
+
+def _finish(faces: Faces, rows: Sequence[tuple[Key, Leg]]) -> list[Draft]:
+    """Kinds, mouths and paths."""
+    legs = [leg for _, leg in rows]
+    picks = [_longest(leg) for leg in legs]
+    start = np.array([leg.points[i] for leg, i in zip(legs, picks, strict=True)])
+    end = np.array([leg.points[i + 1] for leg, i in zip(legs, picks, strict=True)])
+    n, u, v = _axes(end - start, np.array([leg.u[i] for leg, i in zip(legs, picks, strict=True)]))
+    depth = np.array([leg.depth for leg in legs])
+    stations = Stations(
+        origin=start + _MID * (end - start),
+        u=u,
+        v=v,
+        n=n,
+        depth=depth,
+        gap=np.array([leg.gap for leg in legs]),
+        a=np.array([key[0] for key, _ in rows]),
+        b=np.array([key[1] for key, _ in rows]),
+    )
+    shape = classify(
+        faces, stations, np.array([leg.length for leg in legs]), np.array([leg.area for leg in legs])
+    )
+    spots = [_spots(leg) for leg in legs]
+    free = free_sides(
+        faces,
+        np.array([spot[0] for spot in spots]),
+        np.array([spot[1] for spot in spots]),
+        np.array([spot[2] for spot in spots]),
+        depth,
+        stations.gap,
+        np.array([key[3] for key, _ in rows]),
+    )
+    flip = _default_mouth(free, shape.opening, v, stations.origin)
+    out = []
+    for k, (key, leg) in enumerate(rows):
+        path = _path(leg, faces.origin)
+        sides = (bool(free[k, 0]), bool(free[k, 1]))
+        if flip[k]:
+            path, sides = path.flipped(), sides[::-1]
+        out.append(Draft(key[0], key[1], key[2], key[3], str(shape.kind[k]), leg, path, sides))
+    return out
+
+
+def _longest(leg: Leg) -> int:
+    if leg.straight:
+        return 0
+    return int(np.argmax(np.linalg.norm(np.diff(leg.points, axis=0), axis=1)))
+
+
+def _axes(way: Array, across: Array) -> tuple[Array, Array, Array]:
+    """Unit n, u and v = n x u from directions (k, 3) along and across."""
+    n = way / np.linalg.norm(way, axis=1, keepdims=True)
+    u = across - np.einsum("ij,ij->i", across, n)[:, None] * n
+    u = u / np.linalg.norm(u, axis=1, keepdims=True)
+    return n, u, np.cross(n, u)
+
+
+def _spots(leg: Leg) -> tuple[Array, Array, Array]:
+    """Three points of the spine and the u and v directions there, shape (3, 3) each."""
+    way = np.diff(leg.points, axis=0)
+    _, u, v = _axes(way, leg.u)
+    if leg.straight:
+        return leg.points[0] + _SHARES[:, None] * way[0], np.repeat(u, 3, axis=0), np.repeat(v, 3, axis=0)
+    stops = np.concatenate([[0.0], np.cumsum(np.linalg.norm(way, axis=1))])
+    s = _SHARES * stops[-1]
+    i = np.clip(np.searchsorted(stops, s, side="right") - 1, 0, len(way) - 1)
+    t = (s - stops[i]) / (stops[i + 1] - stops[i])
+    return leg.points[i] + t[:, None] * way[i], u[i], v[i]
+
+
+def _path(leg: Leg, origin: Array) -> JointPath:
+    points = leg.points + origin
+    _, u, v = _axes(np.diff(leg.points, axis=0), leg.u)
+    return JointPath(points, u, v, leg.closed)
+
+
+def _default_mouth(free: NDArray[np.bool_], opening: Array, v: Array, origin: Array) -> NDArray[np.bool_]:
+    """Whether the mouth is on the -v side: the free side, else the wide one, else up, else outwards."""
+    outward = np.einsum("ij,ij->i", v, origin)
+    main = v[np.arange(len(v)), np.argmax(np.abs(v), axis=1)]
+    outward = np.where(np.abs(outward) > 1e-6, outward, main)
+    side = np.where(np.abs(v[:, 2]) > 0.5, v[:, 2], outward)
+    side = np.where(opening != 0.0, opening, side)
+    only = free[:, 0] != free[:, 1]
+    side = np.where(only, np.where(free[:, 0], 1.0, -1.0), side)
+    return np.asarray(side < 0.0)

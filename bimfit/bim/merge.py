@@ -1,0 +1,319 @@
+"""Fifth stage of the joint finder: strips of one pair of elements joined into legs and paths."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bimfit.geometry.pose import Array
+
+_PARALLEL = 0.9998
+_STEP_PARALLEL = 0.998
+_HOLE = 0.05
+_SNAP = 1e-3
+_COMMON = 0.8
+_FACET_TURN = (0.004, 0.45)
+
+
+@dataclass(frozen=True)
+class Leg:
+    """A run of facing faces, or several of them end to end.
+
+    Attributes
+    ----------
+    points : ndarray, shape (k, 3)
+        Mid-gap line, m.
+    u : ndarray, shape (k - 1, 3)
+        Directions from A to B.
+    length, depth, gap, low, high, area : float
+        Of the faces that meet: m and m^2; least and greatest gap.
+    legs : tuple of float
+        Length of each run.
+    closed : bool
+    """
+
+    points: Array
+    u: Array
+    length: float
+    depth: float
+    gap: float
+    low: float
+    high: float
+    area: float
+    legs: tuple[float, ...] = ()
+    closed: bool = False
+
+    @property
+    def way(self) -> Array:
+        """Direction from the first point to the last."""
+        d = self.points[-1] - self.points[0]
+        return np.asarray(d / np.linalg.norm(d))
+
+    @property
+    def straight(self) -> bool:
+        """Whether it has two points only."""
+        return len(self.points) == 2
+
+
+def merge(legs: Sequence[Leg]) -> list[Leg]:
+    """Join the strips of one pair and state: facets turned, runs of one plane, steps, then end to end."""
+    if len(legs) < 2:
+        return [_with_legs(leg) for leg in legs]
+    out = _turn_facets(list(legs))
+    out = _join_collinear(out)
+    out = _join_steps(out)
+    return _join_ends([_with_legs(leg) for leg in out])
+
+
+def _with_legs(leg: Leg) -> Leg:
+    return leg if leg.legs else replace(leg, legs=(leg.length,))
+
+
+def _side(leg: Leg) -> Array:
+    return np.cross(leg.way, leg.u[0])
+
+
+def _turn_facets(legs: list[Leg]) -> list[Leg]:
+    """Facets of a curve that are deeper than they are long: let their axes follow the curve."""
+    plain = [i for i, leg in enumerate(legs) if leg.straight]
+    links: dict[int, list[int]] = {i: [] for i in plain}
+    for a, i in enumerate(plain):
+        for j in plain[a + 1 :]:
+            if _neighbours_across(legs[i], legs[j]):
+                links[i].append(j)
+                links[j].append(i)
+    seen: set[int] = set()
+    for i in plain:
+        if i in seen or not links[i]:
+            continue
+        run, queue = [], [i]
+        seen.add(i)
+        while queue:
+            k = queue.pop()
+            run.append(k)
+            fresh = [j for j in links[k] if j not in seen]
+            seen.update(fresh)
+            queue.extend(fresh)
+        if len(run) >= 3 and sum(legs[k].depth for k in run) > max(legs[k].length for k in run):
+            for k in run:
+                legs[k] = _turned(legs[k])
+    return legs
+
+
+def _turned(leg: Leg) -> Leg:
+    middle, side = leg.points.mean(axis=0), _side(leg)
+    points = np.stack([middle - 0.5 * leg.depth * side, middle + 0.5 * leg.depth * side])
+    return replace(leg, points=points, length=leg.depth, depth=leg.length)
+
+
+def _neighbours_across(a: Leg, b: Leg) -> bool:
+    """Whether two strips lie side by side along their long sides and turn a little about them."""
+    turn = float(np.arccos(np.clip(a.u[0] @ b.u[0], -1.0, 1.0)))
+    if not _FACET_TURN[0] < turn < _FACET_TURN[1] or abs(a.way @ b.way) < _STEP_PARALLEL:
+        return False
+    apart = b.points.mean(axis=0) - a.points.mean(axis=0)
+    along = abs(float(apart @ a.way))
+    reach = 0.5 * (a.depth + b.depth)
+    across = float(np.linalg.norm(apart - (apart @ a.way) * a.way))
+    alike = abs(a.length - b.length) < 0.1 * max(a.length, b.length)
+    return alike and along < 0.05 * a.length and abs(across - reach) < 0.1 * reach + 2e-3
+
+
+def _join_collinear(legs: list[Leg]) -> list[Leg]:
+    """Join runs of one plane and one axis with at most 50 mm between them."""
+    done = False
+    while not done:
+        done = True
+        for i in range(len(legs)):
+            for j in range(i + 1, len(legs)):
+                joined = _collinear(legs[i], legs[j])
+                if joined is not None:
+                    legs = [leg for k, leg in enumerate(legs) if k not in (i, j)] + [joined]
+                    done = False
+                    break
+            if not done:
+                break
+    return legs
+
+
+def _collinear(a: Leg, b: Leg) -> Leg | None:
+    if not (a.straight and b.straight) or a.u[0] @ b.u[0] < _PARALLEL or abs(a.way @ b.way) < _PARALLEL:
+        return None
+    way = a.way
+    offset = b.points.mean(axis=0) - a.points.mean(axis=0)
+    beside = offset - (offset @ way) * way
+    if abs(beside @ a.u[0]) > _SNAP or abs(beside @ _side(a)) > 0.1 * max(a.depth, b.depth):
+        return None
+    if abs(a.depth - b.depth) > 0.2 * max(a.depth, b.depth) or abs(a.gap - b.gap) > 2.0 * _SNAP:
+        return None
+    ta, tb = np.sort((a.points - a.points[0]) @ way), np.sort((b.points - a.points[0]) @ way)
+    hole = max(ta[0], tb[0]) - min(ta[1], tb[1])
+    if not -0.005 <= hole <= _HOLE:
+        return None
+    low, high = min(ta[0], tb[0]), max(ta[1], tb[1])
+    length = a.length + b.length
+    return replace(
+        a,
+        points=a.points[0] + np.outer([low, high], way),
+        length=length,
+        depth=(a.depth * a.length + b.depth * b.length) / length,
+        gap=(a.gap * a.area + b.gap * b.area) / (a.area + b.area),
+        low=min(a.low, b.low),
+        high=max(a.high, b.high),
+        area=a.area + b.area,
+    )
+
+
+def _join_steps(legs: list[Leg]) -> list[Leg]:
+    """Join strips beside one another into one stepped section, led by the largest."""
+    legs = sorted(legs, key=lambda leg: -leg.area)
+    out: list[Leg] = []
+    taken = [False] * len(legs)
+    for i, main in enumerate(legs):
+        if taken[i]:
+            continue
+        taken[i] = True
+        group = [main]
+        grown = True
+        while grown:
+            grown = False
+            for j in range(i + 1, len(legs)):
+                if not taken[j] and any(_steps(member, legs[j]) for member in group):
+                    taken[j] = grown = True
+                    group.append(legs[j])
+        out.append(_stepped(main, group))
+    return out
+
+
+def _steps(a: Leg, b: Leg) -> bool:
+    if not (a.straight and b.straight) or abs(a.way @ b.way) < _STEP_PARALLEL or a.u[0] @ b.u[0] < -0.2:
+        return False
+    way = a.way
+    ta, tb = np.sort(a.points @ way), np.sort(b.points @ way)
+    common = min(ta[1], tb[1]) - max(ta[0], tb[0])
+    if common < _COMMON * min(a.length, b.length):
+        return False
+    ends = []
+    for leg in (a, b):
+        middle, side = leg.points.mean(axis=0), _side(leg)
+        ends.append(np.stack([middle - 0.5 * leg.depth * side, middle + 0.5 * leg.depth * side]))
+    apart = ends[0][:, None] - ends[1][None]
+    apart = apart - (apart @ way)[..., None] * way
+    return float(np.linalg.norm(apart, axis=2).min()) < 1.5 * max(abs(a.gap), abs(b.gap)) + 5e-3
+
+
+def _stepped(main: Leg, group: Sequence[Leg]) -> Leg:
+    if len(group) == 1:
+        return main
+    side, spans = _side(main), []
+    for leg in group:
+        middle = float((leg.points.mean(axis=0) - main.points[0]) @ side)
+        half = 0.5 * leg.depth * abs(float(_side(leg) @ side))
+        spans.append((middle - half, middle + half))
+    depth = max(span[1] for span in spans) - min(span[0] for span in spans)
+    return replace(main, depth=max(depth, main.depth), area=sum(leg.area for leg in group))
+
+
+def _join_ends(legs: list[Leg]) -> list[Leg]:
+    """Join legs end to end into polylines, nearest ends first."""
+    open_ = [i for i, leg in enumerate(legs) if not leg.closed]
+    candidates = []
+    for a, i in enumerate(open_):
+        for j in open_[a:]:
+            for e in (0, 1):
+                for f in (0, 1):
+                    if i == j and (e, f) != (1, 0):
+                        continue
+                    distance = _end_distance(legs[i], e, legs[j], f, same=i == j)
+                    if distance is not None:
+                        candidates.append((distance, i, e, j, f))
+    partner: dict[tuple[int, int], tuple[int, int]] = {}
+    for _, i, e, j, f in sorted(candidates):
+        if (i, e) not in partner and (j, f) not in partner:
+            partner[i, e], partner[j, f] = (j, f), (i, e)
+    out = [leg for i, leg in enumerate(legs) if i not in open_]
+    left = set(open_)
+    while left:
+        start = min((i for i in left if (i, 0) not in partner or (i, 1) not in partner), default=min(left))
+        entry = 1 if (start, 0) in partner and (start, 1) not in partner else 0
+        chain: list[Leg] = []
+        i, e = start, entry
+        while i in left:
+            left.discard(i)
+            chain.append(legs[i] if e == 0 else _reversed(legs[i]))
+            onward = partner.get((i, 1 - e))
+            if onward is None:
+                break
+            i, e = onward
+        ring = (start, entry) in partner and len(chain) > 2 and partner[start, entry] == (i, 1 - e)
+        ring = ring or ((start, entry) in partner and i == start and len(chain) > 2)
+        out.append(_chained(chain, closed=ring))
+    return out
+
+
+def _reversed(leg: Leg) -> Leg:
+    return replace(leg, points=leg.points[::-1].copy(), u=leg.u[::-1].copy(), legs=leg.legs[::-1])
+
+
+def _end_distance(a: Leg, e: int, b: Leg, f: int, *, same: bool) -> float | None:
+    """Distance between end e of a and end f of b, where one could go on as the other."""
+    if same:
+        return None
+    pa, pb = a.points[-e], b.points[-f]
+    distance = float(np.linalg.norm(pa - pb))
+    if distance > 1.5 * max(abs(a.gap), abs(b.gap)) + 0.01:
+        return None
+    out = a.points[-1] - a.points[-2] if e else a.points[0] - a.points[1]
+    into = b.points[-2] - b.points[-1] if f else b.points[1] - b.points[0]
+    out, into = out / np.linalg.norm(out), into / np.linalg.norm(into)
+    ua, ub = a.u[-1 if e else 0], b.u[-1 if f else 0]
+    if out @ into < -0.7 or np.cross(out, ua) @ np.cross(into, ub) < 0.7:
+        return None
+    return distance
+
+
+def _chained(chain: Sequence[Leg], *, closed: bool) -> Leg:
+    if len(chain) == 1:
+        return chain[0]
+    points, axes = [chain[0].points], [chain[0].u]
+    for leg in chain[1:]:
+        corner = _corner(points[-1][-2:], leg.points[:2])
+        points[-1] = np.vstack([points[-1][:-1], corner])
+        points.append(np.vstack([corner, leg.points[1:]]))
+        axes.append(leg.u)
+    if closed:
+        corner = _corner(points[-1][-2:], points[0][:2])
+        points[-1] = np.vstack([points[-1][:-1], corner])
+        points[0] = np.vstack([corner, points[0][1:]])
+    line = np.vstack([points[0], *(p[1:] for p in points[1:])])
+    length = sum(leg.length for leg in chain)
+    return Leg(
+        points=line,
+        u=np.vstack(axes),
+        length=length,
+        depth=sum(leg.depth * leg.length for leg in chain) / length,
+        gap=sum(leg.gap * leg.length for leg in chain) / length,
+        low=min(leg.low for leg in chain),
+        high=max(leg.high for leg in chain),
+        area=sum(leg.area for leg in chain),
+        legs=tuple(x for leg in chain for x in leg.legs),
+        closed=closed,
+    )
+
+
+def _corner(a: Array, b: Array) -> Array:
+    """Where leg a's end (2, 3) meets leg b's start (2, 3): where their lines pass nearest, or midway."""
+    middle = 0.5 * (a[1] + b[0])
+    da, db = a[1] - a[0], b[1] - b[0]
+    da, db = da / np.linalg.norm(da), db / np.linalg.norm(db)
+    cosine = float(da @ db)
+    if 1.0 - cosine * cosine < 0.01:
+        return np.asarray(middle)
+    r = b[0] - a[1]
+    s = (r @ da - cosine * (r @ db)) / (1.0 - cosine * cosine)
+    t = (cosine * (r @ da) - r @ db) / (1.0 - cosine * cosine)
+    meeting = 0.5 * (a[1] + s * da + b[0] + t * db)
+    near = np.linalg.norm(meeting - middle) <= 2.0 * np.linalg.norm(r) + 1e-3
+    return np.asarray(meeting if near else middle)

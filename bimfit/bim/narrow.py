@@ -1,0 +1,242 @@
+"""Third stage of the joint finder: where two faces really face each other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bimfit.bim.faces import Faces, Index, components, ranges
+from bimfit.geometry.pose import Array
+
+_TOUCH = 2e-4
+_MIN_PIECE = 1e-7
+_ROWS = 400_000
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Convex pieces of facing faces, in the plane midway between the two.
+
+    Attributes
+    ----------
+    pair : ndarray, shape (p,)
+        Which pair of faces.
+    corners : ndarray, shape (p, k, 2)
+        Coordinates along the pair's axes, m; rows beyond ``count`` repeat the last corner.
+    count : ndarray, shape (p,)
+    area : ndarray, shape (p,)
+        m^2.
+    """
+
+    pair: Index
+    corners: Array
+    count: Index
+    area: Array
+
+    def take(self, rows: Index) -> Pieces:
+        """Some of the pieces."""
+        return Pieces(self.pair[rows], self.corners[rows], self.count[rows], self.area[rows])
+
+
+@dataclass(frozen=True)
+class PairFrames:
+    """For each pair of faces: the mid-plane's axes e1, e2 and normal m (from A to B), and both faces over it.
+
+    ``height_a`` and ``height_b`` (k, 3) are (slope along e1, along e2, constant).
+    """
+
+    a: Index
+    b: Index
+    e1: Array
+    e2: Array
+    m: Array
+    height_a: Array
+    height_b: Array
+
+    def heights(self, pair: Index, points: Array) -> tuple[Array, Array]:
+        """Height of A and of B over the mid-plane's origin at points (..., 2) of the pairs."""
+        shape = (len(pair),) + (1,) * (points.ndim - 2)
+        out = []
+        for plane in (self.height_a[pair], self.height_b[pair]):
+            slope1, slope2, constant = (plane[:, k].reshape(shape) for k in range(3))
+            out.append(slope1 * points[..., 0] + slope2 * points[..., 1] + constant)
+        return out[0], out[1]
+
+    def lift(self, pair: Index, points: Array, height: Array) -> Array:
+        """Points (n, 2) at heights (n,) in the finder's coordinates, shape (n, 3)."""
+        return np.asarray(
+            points[:, :1] * self.e1[pair] + points[:, 1:2] * self.e2[pair] + height[:, None] * self.m[pair]
+        )
+
+
+def pair_frames(faces: Faces, a: Index, b: Index) -> PairFrames:
+    """Mid-planes of face pairs."""
+    na, nb = faces.normal[a], faces.normal[b]
+    m = na - nb
+    m = m / np.linalg.norm(m, axis=1, keepdims=True)
+    least = np.eye(3)[np.argmin(np.abs(m), axis=1)]
+    e1 = np.cross(m, least)
+    e1 = e1 / np.linalg.norm(e1, axis=1, keepdims=True)
+    e2 = np.cross(m, e1)
+    heights = []
+    for n, offset in ((na, faces.offset[a]), (nb, faces.offset[b])):
+        along = np.einsum("ij,ij->i", n, m)
+        terms = [-np.einsum("ij,ij->i", n, e1), -np.einsum("ij,ij->i", n, e2), offset]
+        heights.append(np.stack(terms, axis=1) / along[:, None])
+    return PairFrames(a, b, e1, e2, m, heights[0], heights[1])
+
+
+def facing_pieces(faces: Faces, frames: PairFrames, *, least_gap: float, max_gap: float) -> Pieces:
+    """Clip each triangle of A against each of B in their mid-plane, and by the gap between them."""
+    sizes = np.diff(faces.splits)[frames.b]
+    chunks: list[Pieces] = []
+    ends = np.cumsum(sizes * np.maximum(1, np.diff(faces.splits)[frames.a]))
+    for low, high in _chunks(ends, _ROWS):
+        rows = np.arange(low, high)
+        pieces = _clip_pairs(faces, frames, rows, least_gap, max_gap)
+        if len(pieces.pair):
+            chunks.append(pieces)
+    if not chunks:
+        return Pieces(np.zeros(0, np.int64), np.zeros((0, 3, 2)), np.zeros(0, np.int64), np.zeros(0))
+    widest = max(c.corners.shape[1] for c in chunks)
+    corners = [
+        np.pad(c.corners, ((0, 0), (0, widest - c.corners.shape[1]), (0, 0)), mode="edge") for c in chunks
+    ]
+    return Pieces(
+        np.concatenate([c.pair for c in chunks]),
+        np.concatenate(corners),
+        np.concatenate([c.count for c in chunks]),
+        np.concatenate([c.area for c in chunks]),
+    )
+
+
+def _chunks(ends: Index, most: int) -> list[tuple[int, int]]:
+    """Split rows with these cumulated costs into runs of about ``most`` each."""
+    out, low, spent = [], 0, 0
+    while low < len(ends):
+        high = max(low + 1, int(np.searchsorted(ends, spent + most, side="right")))
+        out.append((low, high))
+        low, spent = high, int(ends[high - 1])
+    return out
+
+
+def _clip_pairs(faces: Faces, frames: PairFrames, rows: Index, least_gap: float, max_gap: float) -> Pieces:
+    b = frames.b[rows]
+    size_b = np.diff(faces.splits)[b]
+    pair = np.repeat(rows, size_b)
+    tri_b = faces.members[ranges(faces.splits[b], size_b)]
+    corners = faces.triangles[tri_b]
+    reach = max(max_gap, -least_gap) + 2e-3
+    fa = frames.a[pair]
+    near = np.all(corners.min(axis=1) <= faces.high[fa] + reach, axis=1)
+    near &= np.all(corners.max(axis=1) >= faces.low[fa] - reach, axis=1)
+    pair, tri_b = pair[near], tri_b[near]
+    fa = frames.a[pair]
+    size_a = np.diff(faces.splits)[fa]
+    which = np.repeat(np.arange(len(pair)), size_a)
+    tri_a = faces.members[ranges(faces.splits[fa], size_a)]
+    pair, tri_b = pair[which], tri_b[which]
+    ta, tb = _flat(faces, frames, pair, tri_a), _flat(faces, frames, pair, tri_b)
+    near = np.all(ta.min(axis=1) < tb.max(axis=1), axis=1) & np.all(tb.min(axis=1) < ta.max(axis=1), axis=1)
+    pair, ta, tb = pair[near], ta[near], tb[near]
+    poly, count = tb, np.full(len(tb), 3)
+    for k in range(3):
+        p, q = ta[:, k], ta[:, (k + 1) % 3]
+        edge = q - p
+        side = edge[:, None, 0] * (poly[..., 1] - p[:, None, 1]) - edge[:, None, 1] * (
+            poly[..., 0] - p[:, None, 0]
+        )
+        poly, count, keep = _clip(poly, count, side)
+        poly, count, pair, ta = poly[keep], count[keep], pair[keep], ta[keep]
+    for sign, limit in ((1.0, least_gap), (-1.0, max_gap)):
+        low, high = frames.heights(pair, poly)
+        poly, count, keep = _clip(poly, count, sign * (high - low - limit))
+        poly, count, pair = poly[keep], count[keep], pair[keep]
+    area = polygon_area(poly)
+    keep = area > _MIN_PIECE
+    return Pieces(pair[keep], poly[keep], count[keep], area[keep])
+
+
+def _flat(faces: Faces, frames: PairFrames, pair: Index, triangles: Index) -> Array:
+    """Triangles in the mid-planes of their pairs, counter-clockwise, shape (n, 3, 2)."""
+    corners = faces.triangles[triangles]
+    x = np.einsum("nij,nj->ni", corners, frames.e1[pair])
+    y = np.einsum("nij,nj->ni", corners, frames.e2[pair])
+    flat = np.stack([x, y], axis=2)
+    turned = polygon_area(flat, signed=True) < 0.0
+    flat[turned] = flat[turned][:, ::-1]
+    return flat
+
+
+def polygon_area(corners: Array, *, signed: bool = False) -> Array:
+    """Shoelace areas of polygons (n, k, 2), whose last corner may be repeated."""
+    p = corners - corners[:, :1]
+    x, y = p[..., 0], p[..., 1]
+    area = 0.5 * (x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)).sum(axis=1)
+    return np.asarray(area if signed else np.abs(area))
+
+
+def _clip(poly: Array, count: Index, side: Array) -> tuple[Array, Index, NDArray[np.bool_]]:
+    """Keep the part of convex polygons (n, k, 2) where ``side`` (n, k), affine, is not negative.
+
+    Sutherland and Hodgman's step for all of them at once. Returns polygons with one more column, their
+    counts and which have any area left.
+    """
+    n, k, _ = poly.shape
+    if not n:
+        return np.zeros((0, k + 1, 2)), count, np.zeros(0, bool)
+    column = np.arange(k)
+    valid = column < count[:, None]
+    onward = np.where(column + 1 < count[:, None], column + 1, 0)
+    row = np.arange(n)[:, None]
+    next_side = side[row, onward]
+    inside = (side >= 0.0) & valid
+    crossing = valid & ((side >= 0.0) != (next_side >= 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = np.where(crossing, side / (side - next_side), 0.0)
+    cut = poly + t[..., None] * (poly[row, onward] - poly)
+    emit = np.stack([inside, crossing], axis=2).reshape(n, 2 * k)
+    points = np.stack([poly, cut], axis=2).reshape(n, 2 * k, 2)
+    total = emit.sum(axis=1)
+    slot = np.cumsum(emit, axis=1) - 1
+    width = max(int(total.max(initial=0)), 1)
+    out = np.zeros((n, width, 2))
+    r, c = np.nonzero(emit)
+    out[r, slot[r, c]] = points[r, c]
+    # repeat the last corner, so that areas and extents may ignore the count
+    last = np.minimum(np.arange(width)[None, :], np.maximum(total - 1, 0)[:, None])
+    return out[row, last], total, total >= 3
+
+
+def strip_labels(pieces: Pieces) -> Index:
+    """Label pieces of one pair that touch within 0.2 mm, shape (p,); pieces come sorted by pair."""
+    n = len(pieces.pair)
+    heads = np.flatnonzero(np.diff(pieces.pair, prepend=-1))
+    sizes = np.diff(np.append(heads, n))
+    position = np.arange(n) - np.repeat(heads, sizes)
+    after = np.repeat(sizes, sizes) - position - 1
+    i = np.repeat(np.arange(n), after)
+    j = ranges(np.arange(n) + 1, after)
+    low, high = pieces.corners.min(axis=1), pieces.corners.max(axis=1)
+    near = np.all(low[i] <= high[j] + _TOUCH, axis=1) & np.all(low[j] <= high[i] + _TOUCH, axis=1)
+    i, j = i[near], j[near]
+    close = ~(_separated(pieces, i, j) | _separated(pieces, j, i))
+    return components(n, i[close], j[close])
+
+
+def _separated(pieces: Pieces, i: Index, j: Index) -> NDArray[np.bool_]:
+    """Whether an edge of piece i has piece j beyond it, by more than 0.2 mm."""
+    p, q = pieces.corners[i], pieces.corners[j]
+    out = np.zeros(len(i), bool)
+    turn = np.sign(polygon_area(p, signed=True))
+    k = p.shape[1]
+    for c in range(k):
+        onward = np.where(c + 1 < pieces.count[i], c + 1, 0)
+        edge = p[np.arange(len(i)), onward] - p[:, c]
+        size = np.linalg.norm(edge, axis=1)
+        outward = np.stack([edge[:, 1], -edge[:, 0]], axis=1) * (turn / np.maximum(size, 1e-12))[:, None]
+        beyond = np.einsum("nkj,nj->nk", q - p[:, c : c + 1], outward).min(axis=1)
+        out |= (beyond > _TOUCH) & (size > 1e-6) & (c < pieces.count[i])
+    return out
