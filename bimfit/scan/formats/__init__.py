@@ -14,7 +14,10 @@ from bimfit.geometry.line_scan import LineScan
 from bimfit.scan.cloud import PointCloud
 from bimfit.scan.formats.delimited import read_csv, write_csv
 from bimfit.scan.formats.npz import read_npz, write_npz
+from bimfit.scan.formats.pcd import read_pcd, write_pcd
+from bimfit.scan.formats.ply import read_ply, write_ply
 from bimfit.scan.formats.text import first_lines
+from bimfit.scan.formats.xyz import read_xyz, write_xyz
 
 Scan = LineScan | PointCloud
 
@@ -49,6 +52,9 @@ class Format:
 FORMATS: tuple[Format, ...] = (
     Format("CSV", (".csv",), read_csv, write_csv, beams=True),
     Format("NPZ", (".npz",), read_npz, write_npz, (b"PK",), beams=True),
+    Format("PLY", (".ply",), read_ply, write_ply, (b"ply",)),
+    Format("PCD", (".pcd",), read_pcd, write_pcd, (b"# .PCD", b"VERSION 0.7", b"VERSION .7")),
+    Format("XYZ", (".xyz", ".txt", ".pts", ".asc"), read_xyz, write_xyz),
 )
 
 

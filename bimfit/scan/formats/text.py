@@ -44,6 +44,7 @@ def read_table(
     names: Sequence[str],
     wanted: Sequence[int],
     may_be_empty: Sequence[int] = (),
+    rows: int | None = None,
 ) -> Array:
     """Read columns of numbers from delimited text.
 
@@ -60,6 +61,8 @@ def read_table(
         Columns to read.
     may_be_empty : sequence of int
         Of these, the columns whose empty cells are NaN; elsewhere an empty cell is an error.
+    rows : int, optional
+        How many lines to read at most; None reads to the end.
 
     Returns
     -------
@@ -74,7 +77,7 @@ def read_table(
     with path.open("rb") as stream:
         for _ in range(skip):
             stream.readline()
-        for block in _whole_lines(stream):
+        for block in _first(_whole_lines(stream), rows):
             parts.append(_parse(path, block, line, delimiter, names, list(wanted), set(may_be_empty)))
             line += block.count(b"\n")
     return np.concatenate(parts) if parts else np.zeros((0, len(wanted)))
@@ -90,6 +93,22 @@ def _whole_lines(stream: BinaryIO) -> Iterator[bytes]:
             yield block[:cut].replace(b"\r\n", b"\n")
     if rest.strip():
         yield rest.replace(b"\r", b"") + b"\n"
+
+
+def _first(blocks: Iterator[bytes], lines: int | None) -> Iterator[bytes]:
+    """Blocks up to a number of lines."""
+    for block in blocks:
+        if lines is None:
+            yield block
+            continue
+        count = block.count(b"\n")
+        if count >= lines:
+            ends = np.flatnonzero(np.frombuffer(block, np.uint8) == 10)
+            if lines:
+                yield block[: ends[lines - 1] + 1]
+            return
+        lines -= count
+        yield block
 
 
 def _parse(

@@ -1,0 +1,88 @@
+"""Plain text points: XYZ, ASC, TXT and PTS, in whatever of their dialects."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from bimfit.errors import ScanError
+from bimfit.geometry.line_scan import LineScan
+from bimfit.scan.cloud import PointCloud
+from bimfit.scan.formats.delimited import BEAM, read_csv
+from bimfit.scan.formats.text import first_lines, read_table
+
+_MOST_HEADER = 20
+
+
+def read_xyz(path: Path) -> LineScan | PointCloud:
+    """Read a row a point: x y z, then intensity (4 or 7 columns) and colours or normals (6 or 7 columns).
+
+    Spaces, tabs, commas or semicolons between the numbers; header lines, comments and the point count of PTS
+    are skipped. A text file with the header of a line scan is read as one.
+
+    Raises
+    ------
+    ScanError
+        Naming the line of the first row that is not such a row.
+    """
+    head = first_lines(path)
+    if b"\0" in head:
+        raise ScanError("not a text file", file=path)
+    lines = head.decode("utf-8-sig", errors="replace").splitlines()
+    if lines and set(BEAM[1:]) <= {word.strip().lower() for word in re.split(r"[,;\t]", lines[0])}:
+        return read_csv(path)
+    skip, delimiter, width = _layout(path, lines)
+    names = ["x", "y", "z", *(f"{k + 1}" for k in range(3, width))]
+    table = read_table(path, skip, delimiter, names, range(width), range(width))
+    finite = np.asarray(np.isfinite(table[:, :3]).all(axis=1))
+    if not finite.any():
+        raise ScanError("the file holds no point", file=path)
+    lost = int((~finite).sum())
+    table = table[finite]
+    rest = table[:, 3:]
+    intensity = rest[:, 0].copy() if width in (4, 7) else None
+    triple = rest[:, -3:] if width in (6, 7) else None
+    colors = triple is not None and bool(
+        np.all((triple == np.round(triple)) & (triple >= 0) & (triple <= 255)) and np.any(triple > 1)
+    )
+    return PointCloud(
+        np.ascontiguousarray(table[:, :3]),
+        normals=triple.copy() if triple is not None and not colors and _unit(triple) else None,
+        colors=triple.astype(np.uint8) if triple is not None and colors else None,
+        intensity=intensity,
+        source=str(path),
+        notes=(f"{lost} rows without coordinates left out",) if lost else (),
+    )
+
+
+def write_xyz(scan: LineScan | PointCloud, path: Path) -> None:
+    """Write x y z a line such that reading gives every number back exactly."""
+    assert isinstance(scan, PointCloud)
+    with path.open("w", encoding="ascii", newline="\n") as stream:
+        stream.writelines(f"{x!r} {y!r} {z!r}\n" for x, y, z in scan.points.tolist())
+
+
+def _layout(path: Path, lines: list[str]) -> tuple[int, str, int]:
+    """Lines before the first point, the delimiter, and how many numbers a row has."""
+    for number, line in enumerate(lines):
+        if number > _MOST_HEADER:
+            break
+        if not line.strip() or line.lstrip().startswith(("#", "//", "%")):
+            continue
+        delimiter = next((mark for mark in ";," if mark in line), " ")
+        words = line.split() if delimiter == " " else line.split(delimiter)
+        try:
+            values = [float(word) for word in words]
+        except ValueError:
+            continue
+        if len(values) >= 3:
+            return number, delimiter, len(values)
+    raise ScanError(
+        "no row of at least three numbers", file=path, place=f"first {len(lines[:_MOST_HEADER])} lines"
+    )
+
+
+def _unit(vectors: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> bool:
+    return bool(np.allclose(np.linalg.norm(vectors, axis=1), 1.0, atol=1e-2))
