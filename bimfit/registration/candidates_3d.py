@@ -35,8 +35,6 @@ def thin(
     flatness : ndarray, shape (m,)
         1 where the neighbourhood is a plane, 0 where it is a line or a ball.
     """
-    from scipy.spatial import cKDTree
-
     rng = np.random.default_rng(seed)
     cells = np.floor((points - points.min(axis=0)) / (size / 150.0)).astype(np.int64)
     order = rng.permutation(len(points))
@@ -45,22 +43,37 @@ def thin(
     if len(kept) > max_points:
         kept = np.sort(rng.choice(kept, max_points, replace=False))
     data = points[kept]
-    tree = cKDTree(points)
+    normals, flatness = plane_normals(points, data, size / 25.0)
+    if eye is not None:
+        normals = normals * np.where(np.einsum("ij,ij->i", normals, eye - data) < 0.0, -1.0, 1.0)[:, None]
+    return data, normals, flatness
+
+
+def plane_normals(points: Array, at: Array, radius: float) -> tuple[Array, Array]:
+    """Normals of the planes through the neighbours of ``at`` (m, 3) in a cloud (n, 3).
+
+    Neighbours are at most 24, and within ``radius`` where eight are.
+
+    Returns
+    -------
+    normals : ndarray, shape (m, 3)
+        Either way round.
+    flatness : ndarray, shape (m,)
+        1 where the neighbourhood is a plane, 0 where it is a line or a ball.
+    """
+    from scipy.spatial import cKDTree
+
     k = min(24, len(points))
-    found = tree.query(data, k=k)
+    found = cKDTree(points).query(at, k=[*range(1, k + 1)])
     distance, index = np.asarray(found[0]), np.asarray(found[1])
-    near = distance <= np.maximum(size / 25.0, distance[:, min(8, k - 1)][:, None])
+    near = distance <= np.maximum(radius, distance[:, min(8, k - 1)][:, None])
     weight = near / near.sum(axis=1, keepdims=True)
     group = points[index]
     offset = group - np.einsum("ik,ikj->ij", weight, group)[:, None]
     covariance = np.einsum("ik,ikj,ikl->ijl", weight, offset, offset)
     values, vectors = np.linalg.eigh(covariance)
-    normals = vectors[:, :, 0]
-    if eye is not None:
-        normals = normals * np.where(np.einsum("ij,ij->i", normals, eye - data) < 0.0, -1.0, 1.0)[:, None]
     middle = np.maximum(values[:, 1], 1e-300)
-    flatness = np.clip(1.0 - 4.0 * values[:, 0] / middle, 0.0, 1.0)
-    return data, np.asarray(normals), np.asarray(flatness)
+    return np.asarray(vectors[:, :, 0]), np.asarray(np.clip(1.0 - 4.0 * values[:, 0] / middle, 0.0, 1.0))
 
 
 def main_directions(normals: Array, weights: Array, *, signed: bool, most: int = 10) -> Array:
