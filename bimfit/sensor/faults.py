@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
 from bimfit.errors import ConfigError
+from bimfit.sensor.scip import with_sum
 
 Kind = Literal[
-    "bad_sum", "flipped_byte", "dropped_byte", "doubled_byte", "truncated", "garbage", "silence", "unplug"
-]
-KINDS: tuple[Kind, ...] = (
     "bad_sum",
     "flipped_byte",
     "dropped_byte",
@@ -21,7 +19,10 @@ KINDS: tuple[Kind, ...] = (
     "garbage",
     "silence",
     "unplug",
-)
+    "checking",
+    "hardware",
+]
+KINDS: tuple[Kind, ...] = get_args(Kind)
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,8 @@ class Fault:
         ``bad_sum``, ``flipped_byte``, ``dropped_byte``, ``doubled_byte``, ``truncated`` damage that scan;
         ``garbage`` puts noise ahead of it and leaves it whole; ``silence`` swallows everything for
         ``length``; ``unplug`` cuts the line in the middle of the scan and plugs the device in again after
-        ``length``, switched off and on.
+        ``length``, switched off and on; ``checking`` and ``hardware`` send the status of a device that checks
+        itself, or has found itself broken, in the scan's place.
     length : float
         How long silence and unplugging last, s of emulated time.
     """
@@ -71,6 +73,8 @@ def damage(scan: bytes, kind: Kind, rng: np.random.Generator) -> bytes:
         return scan[: k + 1] + scan[k:]
     if kind == "truncated":
         return scan[:k]
+    if kind in ("checking", "hardware"):
+        return scan.partition(b"\n")[0] + b"\n" + with_sum(b"21" if kind == "checking" else b"72") + b"\n\n"
     if kind == "garbage":
         return rng.bytes(int(rng.integers(1, 200))) + scan
     return scan

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
-from types import FrameType
-from typing import Any
 
 from bimfit.errors import SensorError
 from bimfit.sensor import scip
 from bimfit.sensor.clock import HostClock, StampUnwrapper, host_clock
 from bimfit.sensor.counters import Counters
+from bimfit.sensor.exits import termination_raises
 from bimfit.sensor.line import Line, bound_clock, must_answer, start_up
 from bimfit.sensor.replies import Reply, ScanReply, device_time, fields
 from bimfit.sensor.scip import Parameters, ScanRequest
@@ -72,27 +69,22 @@ class Hokuyo:
         self._clock = clock or host_clock()
         self._line: Line | None = None
         self._counts = dict.fromkeys(Counters.__dataclass_fields__, 0)
-        self._handler: Any = None
+        self._exits = contextlib.ExitStack()
         self.parameters = Parameters()
         self.version: dict[str, str] = {}
+        self._streaming = False
 
     def __enter__(self) -> Hokuyo:
-        # Before the port opens: a signal that arrives while it does must find the way out too.
-        main = threading.current_thread() is threading.main_thread()
-        if main and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
-            self._handler = signal.signal(signal.SIGTERM, _terminate)
-        try:
+        with contextlib.ExitStack() as exits:
+            # Before the port opens: a signal that arrives while it does must find the way out too.
+            exits.enter_context(termination_raises())
+            exits.callback(self.close)
             self.open()
-        except BaseException:
-            self.__exit__()
-            raise
+            self._exits = exits.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
-        if self._handler is not None:
-            signal.signal(signal.SIGTERM, self._handler)
-            self._handler = None
+        self._exits.close()
 
     def open(self) -> None:
         """Open the port and bring the device to rest, whatever state it was left in.
@@ -159,6 +151,8 @@ class Hokuyo:
             When the answer does not come or is a refusal.
         """
         line = self._open_line()
+        if name[:2] in ("MD", "MS", "GD", "GS"):
+            raise SensorError(f"{name} asks for a scan", remedy="use scan() or scans()")
         try:
             return must_answer(line, scip.command(name, parameter, string).rstrip())
         except Unplugged as error:
@@ -174,10 +168,12 @@ class Hokuyo:
 
     def laser_off(self) -> None:
         """Switch the laser off and end any stream (QT)."""
+        self._streaming = False
         self.query("QT")
 
     def reset(self) -> None:
-        """Laser off, clock, motor speed and baud rate as after switching on (RS)."""
+        """Laser off, any stream ended, clock, motor speed and baud rate as after switching on (RS)."""
+        self._streaming = False
         self.query("RS")
         self._unwrap, self._host = StampUnwrapper(), HostClock()
 
@@ -202,6 +198,7 @@ class Hokuyo:
             When no whole scan comes.
         """
         line = self._open_line()
+        self._insist_on_rest()
         request = self._request("GD", start, end, cluster, 0)
         self.laser_on()
         try:
@@ -251,12 +248,14 @@ class Hokuyo:
         SensorError
             When the device refuses, reports broken hardware, or does not come back.
         """
+        self._insist_on_rest()
         request = self._request("MS" if short else "MD", start, end, cluster, skip)
         delivered = failures = 0
         last: float | None = None
         begun = False
+        self._streaming = True
         try:
-            while count is None or delivered < count:
+            while self._streaming and (count is None or delivered < count):
                 try:
                     if not begun:
                         self._begin(request)
@@ -267,6 +266,8 @@ class Hokuyo:
                     self._come_back(error)
                     begun, last = False, None
                     continue
+                if scan is None and self._over():
+                    break
                 if scan is None:
                     failures += 1
                     self._counts["silent"] += 1
@@ -287,6 +288,13 @@ class Hokuyo:
             raise SensorError(f"step {last} is beyond the device's last, {has.amax}")
         return ScanRequest(name, first, last, cluster, skip)
 
+    def _insist_on_rest(self) -> None:
+        if self._streaming:
+            raise SensorError("a stream is running", remedy="take its next sweep, or end it first")
+
+    def _over(self) -> bool:
+        return not self._streaming
+
     def _begin(self, request: ScanRequest) -> None:
         line = self._open_line()
         line.parser.expect = request
@@ -301,8 +309,9 @@ class Hokuyo:
     def _next(self, line: Line, request: ScanRequest) -> tuple[ScanReply, float] | None:
         """The next scan and its arrival; None after a silence. Raises Unplugged."""
         deadline = time.monotonic() + max(SILENCE, 5 * self.parameters.period * (request.interval + 1))
+        streams = self._streaming
         while not line.scans:
-            if time.monotonic() > deadline:
+            if time.monotonic() > deadline or (streams and self._over()):
                 return None
             line.pump()
             for reply in list(line.replies):
@@ -367,6 +376,7 @@ class Hokuyo:
 
     def _end(self) -> None:
         """End a stream: laser off, and nothing of it is taken for the next one's."""
+        self._streaming = False
         line = self._line
         if line is None:
             return
@@ -390,7 +400,3 @@ class Hokuyo:
         """The device's clock now (II), s, on the scale of ``stamp_device``; NaN when it does not say."""
         ticks = device_time(self.state())
         return float("nan") if ticks is None else self._unwrap(ticks) / 1000.0
-
-
-def _terminate(number: int, frame: FrameType | None) -> None:
-    raise SystemExit(128 + number)

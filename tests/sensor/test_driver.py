@@ -110,7 +110,7 @@ def test_start_in_scip_1_1():
 
 
 def test_start_on_a_slow_device():
-    with emulated(speed=1.0, wait=2.0) as device, use(device.port) as rangefinder:
+    with emulated(speed=1.0, wait=1.2) as device, use(device.port) as rangefinder:
         assert rangefinder.parameters.ares == 1024
 
 
@@ -159,12 +159,15 @@ def test_stamps_are_on_the_hosts_clock():
     assert np.max(np.abs(errors)) < 0.05
 
 
+DAMAGE = [kind for kind in KINDS if kind not in ("checking", "hardware")]
+
+
 def test_ten_minutes_with_a_fault_every_few_seconds():
     """Every intact sweep comes once, every damaged one is counted."""
     rng = np.random.default_rng(5)
     faults, at = [], 3.0
     while at < 600.0:
-        faults.append(Fault(at, KINDS[int(rng.integers(len(KINDS)))], float(rng.uniform(0.1, 0.9))))
+        faults.append(Fault(at, DAMAGE[int(rng.integers(len(DAMAGE)))], float(rng.uniform(0.1, 0.9))))
         at += float(rng.uniform(2.0, 6.0))
     got = []
     with emulated(faults=faults, seed=5) as device, use(device.port) as rangefinder:
@@ -192,6 +195,37 @@ def test_ten_minutes_with_a_fault_every_few_seconds():
     assert broken <= counters.damaged <= broken + truncated
     assert counters.noise >= sum(fault.kind == "garbage" for fault in faults) - 1
     assert counters.silent == 0
+
+
+def test_a_device_that_checks_itself_goes_on():
+    with emulated(faults=[Fault(1.0, "checking")]) as device, use(device.port) as rangefinder:
+        stamps = [round(sweep.stamp_device * 1000) for sweep in rangefinder.scans(count=30)]
+        assert stamps[-1] - stamps[0] == 3000 and rangefinder.counters.missing == 1
+        assert rangefinder.counters.damaged == 0
+
+
+def test_broken_hardware_is_told():
+    with emulated(faults=[Fault(1.0, "hardware")]) as device, use(device.port) as rangefinder:
+        with pytest.raises(SensorError, match="hardware trouble 72"):
+            list(rangefinder.scans(count=30))
+        assert not device.laser
+
+
+def test_the_laser_switched_off_by_hand_ends_the_stream():
+    with emulated(speed=20.0) as device, use(device.port) as rangefinder:
+        taken = 0
+        for sweep in rangefinder.scans():
+            taken += 1
+            with pytest.raises(SensorError, match="a stream is running"):
+                rangefinder.scan()
+            with pytest.raises(SensorError, match="a stream is running"):
+                next(rangefinder.scans())
+            with pytest.raises(SensorError, match=r"use scan\(\)"):
+                rangefinder.query("GD", "0044072501")
+            if sweep.index == 3:
+                rangefinder.laser_off()
+        assert taken == 4 and not device.laser
+        assert len(list(rangefinder.scans(count=2))) == 2
 
 
 def test_silence_starts_the_device_anew():
@@ -364,7 +398,7 @@ def test_the_wrong_device(words):
     try:
         message = "nothing answers.*power" if words == b"" else "no SCIP 2.0 rangefinder.*another port"
         with pytest.raises(SensorError, match=message):
-            use(os.ttyname(slave), timeout=0.6).open()
+            use(os.ttyname(slave), timeout=0.3).open()
     finally:
         stop.set()
         thread.join()

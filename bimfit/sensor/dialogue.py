@@ -1,0 +1,89 @@
+"""Recorded SCIP dialogues: bytes that a device once sent, with or without their times, as sweeps."""
+
+from __future__ import annotations
+
+import math
+import struct
+from pathlib import Path
+
+from bimfit.errors import ScanError, SensorError
+from bimfit.sensor.clock import SCAN_DELAY, StampUnwrapper
+from bimfit.sensor.replies import Damaged, ReplyParser, ScanReply, fields
+from bimfit.sensor.scip import Parameters
+from bimfit.sensor.sweep import Sweep
+
+_HEADER = struct.Struct(">III")  # seconds, microseconds, number of bytes
+_LONGEST = 1 << 16
+
+
+def read_log(path: str | Path) -> list[tuple[float, bytes]]:
+    """Read what was received, and when (s).
+
+    Parameters
+    ----------
+    path : path
+        A log of records (big-endian seconds, microseconds and length, each 32 bits, then the bytes), or the
+        bare bytes, whose time is not known and NaN.
+
+    Raises
+    ------
+    ScanError
+        When the file cannot be read.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise ScanError(f"cannot be read: {error.strerror}", file=path) from error
+    records: list[tuple[float, bytes]] = []
+    at = 0
+    while at < len(data):
+        if at + _HEADER.size > len(data):
+            return records or [(math.nan, data)]
+        seconds, micros, length = _HEADER.unpack_from(data, at)
+        at += _HEADER.size
+        # A log that was cut off keeps what is whole; what does not look like a log at its start is none.
+        if micros >= 1_000_000 or not 0 < length <= _LONGEST or at + length > len(data):
+            return records or [(math.nan, data)]
+        records.append((seconds + micros * 1e-6, data[at : at + length]))
+        at += length
+    return records
+
+
+def read_dialogue(path: str | Path, parameters: Parameters | None = None) -> tuple[Sweep, ...]:
+    """Read the whole scans of a recorded dialogue; every sum is checked.
+
+    Parameters
+    ----------
+    path : path
+        See :func:`read_log`.
+    parameters : Parameters, optional
+        Geometry of the device, where the dialogue has no PP reply; a URG-04LX by default.
+
+    Raises
+    ------
+    ScanError
+        When the file cannot be read or has no whole scan.
+    """
+    found, parser, unwrap = parameters or Parameters(), ReplyParser(), StampUnwrapper()
+    sweeps: list[Sweep] = []
+    broken = 0
+    for time, data in read_log(path):
+        for event in parser.feed(data):
+            if isinstance(event, ScanReply):
+                stamp = unwrap(event.stamp) / 1000.0
+                sweeps.append(
+                    Sweep.from_values(
+                        len(sweeps), event.values, event.request, found, stamp, time - SCAN_DELAY
+                    )
+                )
+            elif isinstance(event, Damaged):
+                broken += 1
+            elif event.name == "PP" and parameters is None:
+                try:
+                    found = Parameters.from_fields(fields(event))
+                except SensorError:
+                    broken += 1
+    if not sweeps:
+        what = f"{broken} damaged pieces and no whole scan" if broken else "no scan"
+        raise ScanError(f"not a SCIP dialogue, or one without ranges: {what}", file=path)
+    return tuple(sweeps)
