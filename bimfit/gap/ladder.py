@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from bimfit.gap.corners import Rungs
 from bimfit.gap.section import GapSection
 from bimfit.geometry.pose import Array
 
@@ -16,37 +16,20 @@ _MATCH = 0.02
 _MAX_RUNGS = 64
 
 
-@dataclass(frozen=True)
-class Ladder:
-    """A run of sections, each with the same rungs.
-
-    Attributes
-    ----------
-    a, b : ndarray, shape (stations, rungs, 3)
-        The rungs' ends on A's and on B's side, world coordinates.
-    opening : ndarray, shape (stations, rungs)
-        Signed width across the gap, m; never between -CLOSED and CLOSED, so that every sign is certain.
-    """
-
-    a: Array
-    b: Array
-    opening: Array
-
-
-def ladder(run: Sequence[GapSection]) -> Ladder:
+def ladder(run: Sequence[GapSection]) -> list[Rungs]:
     """Give every section of a run the same rungs, by share of each side's length.
 
-    Sides that have the same vertices at every station keep them all exactly; otherwise the rungs stand at
-    the shares of every station's vertices, thinned to 64.
+    Sides that have the same vertices at every station keep them all exactly; otherwise the rungs stand at the
+    shares of every station's vertices, thinned to 64. Openings are never between -CLOSED and CLOSED, so that
+    every sign is certain.
     """
-    shares = _shares(run)
-    a, b, opening = [], [], []
-    for section, (share_a, share_b) in zip(run, shares, strict=True):
+    rows = []
+    for section, (share_a, share_b) in zip(run, _shares(run), strict=True):
         pa, pb = _at(section.side_a, share_a), _at(section.side_b, share_b)
-        a.append(section.frame.to_world(pa))
-        b.append(section.frame.to_world(pb))
-        opening.append(_opening(section, pa, pb))
-    return Ladder(np.array(a), np.array(b), np.array(opening))
+        world = section.frame.to_world
+        plane = np.concatenate([pa, pb[::-1]])
+        rows.append(Rungs(world(pa), world(pb), _opening(section, pa, pb), section.frame.n, plane))
+    return rows
 
 
 def _opening(section: GapSection, pa: Array, pb: Array) -> Array:

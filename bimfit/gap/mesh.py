@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bimfit.gap.ladder import Ladder, ladder
+from bimfit.gap.corners import Rungs, with_mitres
+from bimfit.gap.ladder import ladder
 from bimfit.gap.runs import Span, find_runs
 from bimfit.gap.section import GapSection
 from bimfit.geometry.mesh import Faces, TriangleMesh
@@ -96,12 +97,15 @@ def loft(
     for run in runs.sections:
         if len(run) < 2:
             continue
-        v, f, w = _Sheets(ladder(run), ring=runs.ring).build()
-        if not len(f):
+        rows = with_mitres(ladder(run), ring=runs.ring)
+        if len(rows) < 2:
             continue
+        v, f, w = _Sheets(rows, ring=runs.ring and len(rows) > 2).build()
         if _runs_against_normal(run):
             f = f[:, ::-1]
-        found = _check(v, f)
+        v, f, w, found = _checked(v, f, w)
+        if not found:
+            continue
         vertices.append(v)
         faces.append(f + count)
         widths.append(w)
@@ -126,15 +130,16 @@ def _runs_against_normal(run: Sequence[GapSection]) -> bool:
 class _Sheets:
     """Marching triangles on the ladder's grid: keeps what is open, and closes it along A, B and the rims."""
 
-    def __init__(self, steps: Ladder, *, ring: bool) -> None:
-        self._stations, self._rungs = steps.opening.shape
-        self._a, self._b = steps.a.reshape(-1, 3), steps.b.reshape(-1, 3)
-        self._w = steps.opening.ravel()
+    def __init__(self, rows: Sequence[Rungs], *, ring: bool) -> None:
+        self._rows = rows
+        self._stations, self._rungs = len(rows), len(rows[0].opening)
+        self._a, self._b = np.concatenate([r.a for r in rows]), np.concatenate([r.b for r in rows])
+        self._w = np.concatenate([r.opening for r in rows])
         self._ring = ring
         self._keys: dict[_Key, int] = {}
         self._points: list[Array] = []
         self._widths: list[float] = []
-        self._pinched: set[int] = set()
+        self._caps: dict[int, Faces | None] = {}
         self._faces: list[tuple[int, int, int]] = []
         self._rim: list[tuple[int, int, int, int]] = []
 
@@ -148,6 +153,9 @@ class _Sheets:
                 self._triangle(k, k + 1, right + 1)
                 self._triangle(k, right + 1, right)
         self._close_rims()
+        if not self._ring:
+            self._cap(0)
+            self._cap(self._stations - 1)
         return (
             np.array(self._points).reshape(-1, 3),
             np.array(self._faces, np.int64).reshape(-1, 3),
@@ -184,8 +192,29 @@ class _Sheets:
             return False
         i, j = zip(*(divmod(k, self._rungs) for k in nodes), strict=True)
         if i[0] == i[1]:
-            return not self._ring and i[0] in (0, self._stations - 1)
+            return not self._ring and i[0] in (0, self._stations - 1) and not self._whole(i[0])
         return j[0] == j[1] and j[0] in (0, self._rungs - 1)
+
+    def _whole(self, i: int) -> bool:
+        """Whether an end is open all over, so that its cap is the section's own polygon."""
+        part = self._w[i * self._rungs : (i + 1) * self._rungs]
+        return self._rows[i].plane is not None and bool((part > 0.0).all()) and self._capped(i) is not None
+
+    def _capped(self, i: int) -> Faces | None:
+        """Triangles of an end's polygon; None where its outline crosses itself and the rungs must do."""
+        if i not in self._caps:
+            self._caps[i] = _triangulate(self._rows[i].plane)
+        return self._caps[i]
+
+    def _cap(self, i: int) -> None:
+        triangles = self._capped(i) if self._whole(i) else None
+        if triangles is None:
+            return
+        nodes = range(i * self._rungs, (i + 1) * self._rungs)
+        ring = [self._vertex((k, k), 0) for k in nodes] + [self._vertex((k, k), 1) for k in reversed(nodes)]
+        for p, q, r in triangles.tolist():
+            # Seen along n the polygon runs counter-clockwise: outwards at the last station.
+            self._face(ring[p], ring[r], ring[q]) if i == 0 else self._face(ring[p], ring[q], ring[r])
 
     def _close_rims(self) -> None:
         for pa, qa, pb, qb in self._rim:
@@ -218,8 +247,27 @@ class _Sheets:
         return self._keys[name]
 
 
-def _check(vertices: Array, faces: Faces) -> int:
-    """Make sure of closed, oriented bodies of positive volume; their number.
+def _triangulate(ring: Array | None) -> Faces | None:
+    """Triangles of a simple counter-clockwise polygon that keep all its edges, or None."""
+    import manifold3d
+    import shapely
+
+    if ring is None or not shapely.is_valid(shapely.polygons(ring)):
+        return None
+    try:
+        triangles = np.asarray(manifold3d.triangulate([ring]), np.int64).reshape(-1, 3)
+    except (ValueError, RuntimeError):
+        return None
+    n = len(ring)
+    edges = set(zip(triangles.ravel().tolist(), np.roll(triangles, -1, axis=1).ravel().tolist(), strict=True))
+    kept = len(triangles) == n - 2 and all((k, (k + 1) % n) in edges for k in range(n))
+    return triangles if kept else None
+
+
+def _checked(vertices: Array, faces: Faces, width: Array) -> tuple[Array, Faces, Array, int]:
+    """Make sure of closed, oriented bodies; their number comes last.
+
+    Those without a positive volume, which sections that cut each other leave behind, are left out.
 
     Raises
     ------
@@ -229,17 +277,20 @@ def _check(vertices: Array, faces: Faces) -> int:
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
+    if not len(faces):
+        return vertices, faces, width, 0
     n = len(vertices)
     start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     there, back = start * n + end, end * n + start
     if len(np.unique(there)) != len(there) or not np.array_equal(np.sort(there), np.sort(back)):
         raise ArithmeticError("the lofted gap is not a closed, oriented 2-manifold")
-    count, label = connected_components(
-        coo_array((np.ones(len(start), np.int8), (start, end)), (n, n)), directed=False
-    )
-    p = vertices - vertices.mean(axis=0)
-    t = p[faces]
+    edges = coo_array((np.ones(len(start), np.int8), (start, end)), (n, n))
+    count, label = connected_components(edges, directed=False)
+    t = (vertices - vertices.mean(axis=0))[faces]
     six = np.einsum("ij,ij->i", t[:, 0], np.cross(t[:, 1], t[:, 2]))
-    if not (np.bincount(label[faces[:, 0]], six, count) > 0.0).all():
-        raise ArithmeticError("a body of the lofted gap has no positive volume")
-    return int(count)
+    good = np.bincount(label[faces[:, 0]], six, count) > 0.0
+    if good.all():
+        return vertices, faces, width, int(count)
+    kept = good[label]
+    number = np.cumsum(kept) - 1
+    return vertices[kept], number[faces[kept[faces[:, 0]]]], width[kept], int(good.sum())

@@ -65,7 +65,8 @@ class GapSection:
     angle : float
         By how much the line through the mouth corners turned from its design, rad, in (-pi/2, pi/2].
     width_mouth, width_root : float
-        Distance of the two mouth (root) corners, m; negative where B's corner has passed A's.
+        Distance of the two mouth (root) corners, m; negative where B's corner has passed A's, across the
+        joint (a step between the two counts into the distance, as it does into the angle).
     width_narrowest : float
         Least distance of the two sides, m; 0 where they touch; negative where they overlap: how deep.
     area : float
@@ -158,9 +159,10 @@ def gap_section(
     designed_a, designed_b = outline.side_a.tolist(), outline.side_b.tolist()
     a, b = _moved(designed_a, pose_a), _moved(designed_b, pose_b)
     clearance = measure(a, b)
+    across = _across(a, b)
     turn = 0.5 * (pose_a.theta + pose_b.theta)
-    mouth = _Line(a[0], b[0], _direction(designed_a[0], designed_b[0]), turn)
-    root = _Line(a[-1], b[-1], _direction(designed_a[-1], designed_b[-1]), turn)
+    mouth = _Line(a[0], b[0], across, _direction(designed_a[0], designed_b[0]), turn)
+    root = _Line(a[-1], b[-1], across, _direction(designed_a[-1], designed_b[-1]), turn)
     sigma = None
     if cov_a is not None and cov_b is not None:
         cov = _joint(cov_a, cov_b, cov_ab)
@@ -194,19 +196,26 @@ def _direction(a: list[float], b: list[float]) -> float:
     return math.atan2(dv, du) if math.hypot(du, dv) > TOUCH else 0.0
 
 
+def _across(a: list[Point], b: list[Point]) -> Point:
+    """Unit direction from A's side to B's: to the left of both, walking from mouth to root."""
+    du = a[-1][0] - a[0][0] + b[-1][0] - b[0][0]
+    dv = a[-1][1] - a[0][1] + b[-1][1] - b[0][1]
+    size = math.hypot(du, dv)
+    return (-dv / size, du / size) if size > 0.0 else (1.0, 0.0)
+
+
 class _Line:
     """The line from a corner of A to one of B, against its design."""
 
-    def __init__(self, a: Point, b: Point, designed: float, turn: float) -> None:
+    def __init__(self, a: Point, b: Point, across: Point, designed: float, turn: float) -> None:
         du, dv = b[0] - a[0], b[1] - a[1]
         self.length = math.hypot(du, dv)
-        expected = (math.cos(designed + turn), math.sin(designed + turn))
-        sign = 1.0 if du * expected[0] + dv * expected[1] >= 0.0 else -1.0
+        sign = 1.0 if du * across[0] + dv * across[1] >= 0.0 else -1.0
         #: Negative where B's corner has passed A's.
         self.width = sign * self.length
         known = self.length > 1e-12
-        #: From A to B as designed, whichever corner comes first now.
-        self.along = (sign * du / self.length, sign * dv / self.length) if known else expected
+        #: From A's side to B's, whichever corner comes first now.
+        self.along = (sign * du / self.length, sign * dv / self.length) if known else across
         angle = math.atan2(dv, du) - designed if known else turn
         # A line's angle is known but for half turns.
         self.angle = math.pi / 2.0 - (math.pi / 2.0 - angle) % math.pi
@@ -230,6 +239,8 @@ def _propagate(
     clearance: Clearance,
     cov: Array,
 ) -> GapSigma | None:
+    if not np.isfinite(cov).all():
+        return None
     (a, b), (mouth, root), (pose_a, pose_b) = sides, lines, poses
 
     def pull(at_a: Point, at_b: Point, fu: float, fv: float, gu: float, gv: float) -> list[float]:
@@ -256,8 +267,6 @@ def _propagate(
         rows.append(apart((au, av), (bu, bv), ((bu - au) / size, (bv - av) / size)))
     J = np.array(rows)
     variance = np.einsum("ij,ij->i", J @ cov, J).tolist()
-    if not all(map(math.isfinite, variance)):
-        return None
     sd = [math.sqrt(max(x, 0.0)) for x in variance]
     if not clearance.simple:
         sd += _cubature(outline, poses, clearance, cov)
