@@ -9,6 +9,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from bimfit.geometry.pose import Array, transform_points
 
+FARTHEST = 1e12
+"""No coordinate is greater than this in any unit: what a file says beyond it is damage."""
+
+
+def usable(points: Array) -> NDArray[np.bool_]:
+    """Which points (n, 3) have coordinates that can be calculated with, shape (n,)."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray((np.abs(points) <= FARTHEST).all(axis=1))
+
 
 @dataclass(frozen=True)
 class PointCloud:

@@ -17,7 +17,7 @@ from bimfit.scan.formats.npz import read_npz, write_npz
 from bimfit.scan.formats.pcd import read_pcd, write_pcd
 from bimfit.scan.formats.ply import read_ply, write_ply
 from bimfit.scan.formats.text import first_lines
-from bimfit.scan.formats.xyz import read_xyz, write_xyz
+from bimfit.scan.formats.xyz import looks_like_points, read_xyz, write_xyz
 
 Scan = LineScan | PointCloud
 
@@ -51,8 +51,8 @@ class Format:
 
 FORMATS: tuple[Format, ...] = (
     Format("CSV", (".csv",), read_csv, write_csv, beams=True),
-    Format("NPZ", (".npz",), read_npz, write_npz, (b"PK",), beams=True),
-    Format("PLY", (".ply",), read_ply, write_ply, (b"ply",)),
+    Format("NPZ", (".npz",), read_npz, write_npz, (b"PK\x03\x04",), beams=True),
+    Format("PLY", (".ply",), read_ply, write_ply, (b"ply\n", b"ply\r\n")),
     Format("PCD", (".pcd",), read_pcd, write_pcd, (b"# .PCD", b"VERSION 0.7", b"VERSION .7")),
     Format("XYZ", (".xyz", ".txt", ".pts", ".asc"), read_xyz, write_xyz),
 )
@@ -64,7 +64,8 @@ def read_scan(path: str | Path, unit: float = 1.0) -> Scan:
     Parameters
     ----------
     path : str or Path
-        The extension names the format; where it does not, the content does.
+        The content names the format where it can (PLY, PCD, NPZ), else the extension, else whether it looks
+        like rows of numbers.
     unit : float
         Metres a unit of length of the file.
 
@@ -116,13 +117,16 @@ def scaled(scan: Scan, factor: float) -> Scan:
 
 
 def _format_of(path: Path, head: bytes) -> Format:
+    # what a file says of itself beats its name
+    for form in FORMATS:
+        if any(head.startswith(magic) for magic in form.magic):
+            return form
     suffix = path.suffix.lower()
     for form in FORMATS:
         if suffix in form.extensions:
             return form
-    for form in FORMATS:
-        if any(head.startswith(magic) for magic in form.magic):
-            return form
+    if looks_like_points(head):
+        return next(form for form in FORMATS if form.name == "XYZ")
     known = ", ".join(extension for form in FORMATS for extension in form.extensions)
     raise ScanError(
         f"unknown kind of scan file {suffix or '(no extension)'}", file=path, remedy=f"known are {known}"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bimfit.errors import ScanError
 from bimfit.geometry.line_scan import LineScan
 from bimfit.geometry.pose import Array
-from bimfit.scan.cloud import PointCloud
+from bimfit.scan.cloud import FARTHEST, PointCloud, usable
 from bimfit.scan.formats.text import first_lines, number_at, read_table
 
 BEAM = ("scan", "ox", "oy", "oz", "dx", "dy", "dz", "range")
@@ -88,12 +88,14 @@ def check_beams(
     if not len(columns["range"]):
         raise ScanError("the file holds no beam", file=path)
     for name in BEAM[:-1]:
-        bad = ~np.isfinite(columns[name])
+        bad = ~(np.abs(columns[name]) <= (2**53 if name == "scan" else FARTHEST))
         if bad.any():
             row = int(np.argmax(bad))
-            raise ScanError("not a finite number", file=path, place=f"{place(row)}, column {name}")
+            raise ScanError(
+                "not a finite number, or not in any world", file=path, place=f"{place(row)}, column {name}"
+            )
     numbers = columns["scan"]
-    odd = (numbers != np.round(numbers)) | (np.abs(numbers) > 2**53)
+    odd = numbers != np.round(numbers)
     if odd.any():
         row = int(np.argmax(odd))
         raise ScanError(
@@ -124,7 +126,7 @@ def check_beams(
     notes: tuple[str, ...] = ()
     if (zero := ranges == 0.0).any():
         notes = (f"{int(zero.sum())} ranges are 0 and count as nothing came back",)
-    ranges[zero | ~np.isfinite(ranges)] = np.nan
+    ranges[zero | ~(np.abs(ranges) <= FARTHEST)] = np.nan
     origins = np.stack([columns[name] for name in ("ox", "oy", "oz")], axis=1).astype(np.float64)
     return LineScan(numbers.astype(np.int64), origins, directions, ranges, str(path), notes, extra)
 
@@ -156,14 +158,19 @@ def _header(path: Path) -> tuple[list[str], int, str]:
         raise ScanError("not a text file", file=path, remedy="expected CSV with a header") from error
     if "\0" in text:
         raise ScanError("not a text file", file=path, remedy="expected CSV with a header")
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(text.split("\n"), start=1):
         if line.strip() and not line.lstrip().startswith("#"):
             delimiter = max(",;\t", key=line.count)
-            names = [
-                name.strip().lower() for name in next(csv.reader(io.StringIO(line), delimiter=delimiter))
-            ]
+            names = [name.strip().lower() for name in _cells(line.rstrip("\r"), delimiter)]
             return names, number, delimiter
     raise ScanError("no header", file=path, remedy=f"expected {','.join(BEAM)}")
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    try:
+        return next(csv.reader(io.StringIO(line), delimiter=delimiter), [])
+    except csv.Error:
+        return line.split(delimiter)
 
 
 def _numeric_extras(
@@ -174,7 +181,7 @@ def _numeric_extras(
         for _ in range(skip):
             stream.readline()
         first = stream.readline().decode("utf-8", errors="replace")
-    cells = next(csv.reader(io.StringIO(first), delimiter=delimiter), [])
+    cells = _cells(first.rstrip("\r\n"), delimiter)
     out = []
     for k, name in enumerate(header):
         if k in needed or not name or header.index(name) != k or k >= len(cells):
@@ -192,7 +199,7 @@ def _points(path: Path, header: list[str], columns: dict[str, int], skip: int, d
     bright = columns.get("intensity")
     cells = wanted if bright is None else [*wanted, bright]
     table = read_table(path, skip, delimiter, header, cells, cells)
-    finite = np.asarray(np.isfinite(table[:, :3]).all(axis=1))
+    finite = usable(table[:, :3])
     if not finite.any():
         raise ScanError("the file holds no point", file=path)
     table = table[finite]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bimfit.errors import ScanError
 from bimfit.geometry.line_scan import LineScan
-from bimfit.scan.cloud import PointCloud
+from bimfit.scan.cloud import PointCloud, usable
 from bimfit.scan.formats.delimited import BEAM, check_beams
 
 
@@ -56,7 +56,7 @@ def write_npz(scan: LineScan | PointCloud, path: Path) -> None:
 
 def _arrays(path: Path) -> dict[str, NDArray[np.generic]]:
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             if not isinstance(archive, np.lib.npyio.NpzFile):
                 raise ScanError("not an .npz archive", file=path)
             return {name: archive[name] for name in archive.files}
@@ -84,7 +84,7 @@ def _points(path: Path, arrays: dict[str, NDArray[np.generic]]) -> PointCloud:
     if raw.ndim != 2 or raw.shape[1] != 3 or raw.dtype.kind not in "fiu":
         raise ScanError(f"expected numbers of shape (n, 3), got {raw.shape}", file=path, place="array points")
     points = raw.astype(np.float64)
-    keep = np.isfinite(points).all(axis=1)
+    keep = usable(points)
     if not keep.any():
         raise ScanError("the file holds no point", file=path)
 

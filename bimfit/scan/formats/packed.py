@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bimfit.errors import ScanError
 from bimfit.geometry.pose import Array
-from bimfit.scan.cloud import PointCloud
+from bimfit.scan.cloud import PointCloud, usable
 
 Columns = Mapping[str, NDArray[np.generic]]
 
@@ -36,7 +36,7 @@ def cloud_of(
     """
     xyz = [columns[name] for name in ("x", "y", "z")]
     points = np.stack([column.astype(np.float64) for column in xyz], axis=1)
-    keep = np.asarray(np.isfinite(points).all(axis=1))
+    keep = usable(points)
     if not keep.any():
         raise ScanError("the file holds no point", file=path)
     lost = len(points) - int(keep.sum())

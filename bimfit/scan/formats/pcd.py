@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bimfit.errors import ScanError
 from bimfit.geometry.line_scan import LineScan
 from bimfit.geometry.pose import Array
-from bimfit.scan.cloud import PointCloud
+from bimfit.scan.cloud import PointCloud, usable
 from bimfit.scan.formats.organised import beams_of
 from bimfit.scan.formats.packed import cloud_of
 from bimfit.scan.formats.text import first_lines, read_table
@@ -71,6 +71,7 @@ def read_pcd(path: Path) -> LineScan | PointCloud:
     eye = header.viewpoint if header.viewpoint is not None else np.zeros(3)
     if header.height > 1:
         points = np.stack([columns[n].astype(np.float64) for n in "xyz"], axis=1)
+        points[~usable(points)] = np.nan
         scan = beams_of(points.reshape(header.height, header.width, 3), eye, str(path), columns["x"].dtype)
         if scan is not None:
             return scan
@@ -146,7 +147,7 @@ def _fill(out: _Header, values: dict[str, list[str]]) -> None:
         out.width, out.height = out.points, 1
     if "VIEWPOINT" in values:
         eye = np.array([float(x) for x in values["VIEWPOINT"][:3]])
-        out.viewpoint = eye if eye.shape == (3,) and np.isfinite(eye).all() else None
+        out.viewpoint = eye if eye.shape == (3,) and usable(eye[None])[0] else None
     out.data = values["DATA"][0]
     if out.data not in ("ascii", "binary", "binary_compressed"):
         raise ValueError(f"DATA {out.data}")

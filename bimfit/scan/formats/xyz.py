@@ -9,7 +9,7 @@ import numpy as np
 
 from bimfit.errors import ScanError
 from bimfit.geometry.line_scan import LineScan
-from bimfit.scan.cloud import PointCloud
+from bimfit.scan.cloud import PointCloud, usable
 from bimfit.scan.formats.delimited import BEAM, read_csv
 from bimfit.scan.formats.text import first_lines, read_table
 
@@ -30,13 +30,13 @@ def read_xyz(path: Path) -> LineScan | PointCloud:
     head = first_lines(path)
     if b"\0" in head:
         raise ScanError("not a text file", file=path)
-    lines = head.decode("utf-8-sig", errors="replace").splitlines()
-    if lines and set(BEAM[1:]) <= {word.strip().lower() for word in re.split(r"[,;\t]", lines[0])}:
+    lines = head.decode("utf-8-sig", errors="replace").split("\n")
+    if _is_line_scan(lines):
         return read_csv(path)
     skip, delimiter, width = _layout(path, lines)
     names = ["x", "y", "z", *(f"{k + 1}" for k in range(3, width))]
     table = read_table(path, skip, delimiter, names, range(width), range(width))
-    finite = np.asarray(np.isfinite(table[:, :3]).all(axis=1))
+    finite = usable(table[:, :3])
     if not finite.any():
         raise ScanError("the file holds no point", file=path)
     lost = int((~finite).sum())
@@ -62,6 +62,21 @@ def write_xyz(scan: LineScan | PointCloud, path: Path) -> None:
     assert isinstance(scan, PointCloud)
     with path.open("w", encoding="ascii", newline="\n") as stream:
         stream.writelines(f"{x!r} {y!r} {z!r}\n" for x, y, z in scan.points.tolist())
+
+
+def looks_like_points(head: bytes) -> bool:
+    """Whether the start of a file is text with rows of numbers, or the header of a line scan."""
+    if b"\0" in head:
+        return False
+    lines = head.decode("utf-8-sig", errors="replace").split("\n")
+    try:
+        return _is_line_scan(lines) or bool(_layout(Path(), lines))
+    except ScanError:
+        return False
+
+
+def _is_line_scan(lines: list[str]) -> bool:
+    return set(BEAM[1:]) <= {word.strip().lower() for word in re.split(r"[,;\t]", lines[0])}
 
 
 def _layout(path: Path, lines: list[str]) -> tuple[int, str, int]:
