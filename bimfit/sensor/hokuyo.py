@@ -257,10 +257,8 @@ class Hokuyo:
         try:
             while self._streaming and (count is None or delivered < count):
                 try:
-                    if not begun:
-                        self._begin(request)
-                        begun = True
-                    scan = self._next(self._open_line(), request)
+                    begun = begun or self._begin(request)
+                    scan = self._next(self._open_line(), request) if begun else None
                 except Unplugged as error:
                     self._counts["unplugged"] += 1
                     self._come_back(error)
@@ -271,7 +269,8 @@ class Hokuyo:
                 if scan is None:
                     failures += 1
                     self._counts["silent"] += 1
-                    begun = self._wake(failures)
+                    self._wake(failures)
+                    begun = False
                     continue
                 sweep = self._sweep(*scan, index=delivered)
                 self._count_missing(last, sweep.stamp_device, skip)
@@ -295,16 +294,15 @@ class Hokuyo:
     def _over(self) -> bool:
         return not self._streaming
 
-    def _begin(self, request: ScanRequest) -> None:
+    def _begin(self, request: ScanRequest) -> bool:
+        """Start the stream; whether the device answers. Raises Unplugged."""
         line = self._open_line()
         line.parser.expect = request
         reply = line.ask_stream(request.encode())
-        if reply is None:
-            raise SensorError("the rangefinder does not answer", file=line.port)
-        if not scip.accepted(reply.name, reply.status):
-            raise SensorError(
-                f"the rangefinder refuses: {scip.meaning(reply.name, reply.status)}", file=line.port
-            )
+        if reply is not None and not scip.accepted(reply.name, reply.status):
+            what = scip.meaning(reply.name, reply.status)
+            raise SensorError(f"the rangefinder refuses: {what}", file=line.port)
+        return reply is not None
 
     def _next(self, line: Line, request: ScanRequest) -> tuple[ScanReply, float] | None:
         """The next scan and its arrival; None after a silence. Raises Unplugged."""
@@ -339,19 +337,19 @@ class Hokuyo:
             turns = round((stamp - last) / (self.parameters.period * (skip + 1)))
             self._counts["missing"] += max(turns - 1, 0)
 
-    def _wake(self, failures: int) -> bool:
-        """Start a silent device anew; whether the stream runs (it never does yet). Raises SensorError."""
+    def _wake(self, failures: int) -> None:
+        """Bring a device that fell silent to rest, to start the stream anew."""
         line = self._open_line()
+        line.parser.expect = None
+        silent = SensorError("the rangefinder fell silent", file=line.port, remedy="look after its cable")
         if failures > 3:
-            raise SensorError(
-                "the rangefinder fell silent", file=line.port, remedy="is something wrong with the cable?"
-            )
+            raise silent
         try:
-            line.parser.expect = None
             start_up(line, self._timeout)
         except Unplugged:
             pass  # the next request finds out, and counts it
-        return False
+        except SensorError as error:
+            raise silent from error
 
     def _come_back(self, cause: Unplugged) -> None:
         """Wait until the device is there again and open it."""

@@ -130,6 +130,7 @@ def start_up(line: Line, timeout: float) -> None:
     SensorError
         When nothing answers, or what answers is no rangefinder.
     """
+    line.heard = b""
     deadline = time.monotonic() + timeout
     while time.monotonic() < deadline:
         line.write(b"\n")  # ends a request that a crashed program left unfinished

@@ -70,6 +70,9 @@ def _from_line_scan(scan: LineScan, parameters: Parameters) -> list[IntArray]:
     for number in scan.sweeps:
         chosen = scan.scan == number
         directions, ranges = scan.directions[chosen], scan.ranges[chosen]
+        mm = np.rint(np.nan_to_num(ranges, nan=0.0) * 1000.0).astype(np.int64)
+        # Our own recordings know the codes of what is missing.
+        missing = np.asarray(scan.extra["code"])[chosen].astype(np.int64) if "code" in scan.extra else 0
         ahead = directions[len(directions) // 2]
         # Beams are numbered counter-clockwise seen from above, so the first one looks to the right.
         up = np.cross(directions[0], directions[-1])
@@ -80,8 +83,7 @@ def _from_line_scan(scan: LineScan, parameters: Parameters) -> list[IntArray]:
         left = np.cross(up / np.linalg.norm(up), ahead)
         bearings = np.arctan2(directions @ left, directions @ ahead)
         steps = np.rint(bearings / (2.0 * np.pi) * parameters.ares).astype(np.int64) + parameters.afrt
-        mm = np.rint(np.nan_to_num(ranges, nan=0.0) * 1000.0).astype(np.int64)
-        values = np.where((mm >= parameters.dmin) & (mm <= parameters.dmax), mm, 0)
+        values = np.where((mm >= parameters.dmin) & (mm <= parameters.dmax), mm, missing)
         row = np.zeros(parameters.amax - parameters.amin + 1, dtype=np.int64)
         inside = (steps >= parameters.amin) & (steps <= parameters.amax)
         row[steps[inside] - parameters.amin] = values[inside]

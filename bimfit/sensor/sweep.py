@@ -22,7 +22,7 @@ class Sweep:
     index : int
         Sweeps delivered before this one.
     ranges : ndarray, shape (n,)
-        m; NaN where there is no measurement, see :attr:`reasons`.
+        m; NaN where there is no measurement, also beyond the device's own DMAX; see :attr:`reasons`.
     codes : ndarray, shape (n,)
         What the device sent: mm, or error codes below 20.
     bearings : ndarray, shape (n,)
@@ -35,8 +35,6 @@ class Sweep:
         The device's clock at step 0, s, unwrapped.
     stamp_host : float
         The same moment on the host's clock, s since 1970.
-    dmax : float
-        Farthest range the device vouches for, m; what lies beyond is missing.
     """
 
     index: int
@@ -47,7 +45,6 @@ class Sweep:
     delays: FloatArray
     stamp_device: float
     stamp_host: float
-    dmax: float
 
     @classmethod
     def from_values(
@@ -61,7 +58,6 @@ class Sweep:
     ) -> Sweep:
         """Make it of a scan's values, shape (request.size,)."""
         steps = request.middles
-        dmax = parameters.dmax / 1000.0
         measured = (values >= FIRST_MEASUREMENT) & (values <= parameters.dmax)
         return cls(
             index,
@@ -72,7 +68,6 @@ class Sweep:
             steps / parameters.ares * parameters.period,
             stamp_device,
             stamp_host,
-            dmax,
         )
 
     @property

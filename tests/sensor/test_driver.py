@@ -238,6 +238,12 @@ def test_silence_starts_the_device_anew():
         assert rangefinder.counters.silent == 1 and rangefinder.counters.unplugged == 0
 
 
+def test_silence_for_good():
+    with emulated(speed=20.0, faults=[Fault(1.5, "silence", 1e6)]) as device:
+        with use(device.port, timeout=0.3) as rangefinder, pytest.raises(SensorError, match="fell silent"):
+            list(rangefinder.scans(count=100))
+
+
 def test_unplugged_for_good():
     with emulated(speed=20.0, faults=[Fault(3.0, "unplug", 1e6)]) as device:
         with (

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -111,9 +113,11 @@ def test_a_line_scan_is_replayed_wherever_it_was_taken():
     pose[:3, 3] = [458657.0, 5438232.0, 3.0]
     scan = line_scan([sweep_of(row, k, request) for k, row in enumerate(rows)], pose)
     measure = measurer(scan, HAS, Noise(), rng)
+    bare = measurer(replace(scan, extra={}), HAS, Noise(), rng)
     for k, row in enumerate(rows):
         got = measure(0.1 * k)
-        assert got[299 - 44 : 470 - 44].tolist() == np.where(row < 20, 0, row).tolist()
+        assert got[299 - 44 : 470 - 44].tolist() == row.tolist()
+        assert bare(0.1 * k)[299 - 44 : 470 - 44].tolist() == np.where(row < 20, 0, row).tolist()
         assert not got[: 299 - 44].any() and not got[470 - 44 :].any()
 
 
