@@ -239,9 +239,9 @@ def test_silence_starts_the_device_anew():
 
 
 def test_silence_for_good():
-    with emulated(speed=20.0, faults=[Fault(1.5, "silence", 1e6)]) as device:
-        with use(device.port, timeout=0.3) as rangefinder, pytest.raises(SensorError, match="fell silent"):
-            list(rangefinder.scans(count=100))
+    faults, told = [Fault(1.5, "silence", 1e6)], pytest.raises(SensorError, match="fell silent")
+    with emulated(speed=20.0, faults=faults) as device, use(device.port, timeout=0.3) as rangefinder, told:
+        list(rangefinder.scans(count=100))
 
 
 def test_unplugged_for_good():
