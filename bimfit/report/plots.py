@@ -143,12 +143,13 @@ def _band(
     names: np.ndarray[tuple[int, ...], np.dtype[np.str_]],
 ) -> None:
     mm = s * 1e3
-    if sigma is not None:
+    if sigma is not None and np.isfinite(sigma).any():
         ax.fill_between(
             mm, value - 2.0 * sigma, value + 2.0 * sigma, color=ESTIMATE, alpha=0.18, lw=0, label="± 2σ"
         )
-    ax.plot(mm, value, color=ESTIMATE, lw=1.2, label="estimate", zorder=4)
     known = np.isfinite(value)
+    if known.any():
+        ax.plot(mm, value, color=ESTIMATE, lw=1.2, label="estimate", zorder=4)
     for name, (colour, marker) in STATUS.items():
         pick = (names == name) & known
         if pick.any():

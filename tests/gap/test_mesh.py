@@ -288,3 +288,68 @@ def test_what_cannot_be_written_leaves_what_was_there(tmp_path):
         export_mesh(loft(wandering(3)), tmp_path / "folder.ply")
     assert kept.read_text() == "earlier"
     assert {p.name for p in tmp_path.iterdir()} == {"gap.stl", "folder.ply"}
+
+
+def perimeter(spacing, start, size=(0.6, 0.4), half=0.01, depth=0.06):
+    """Sections along the joint round a rectangular panel, axes kept on every leg as geometry.path does."""
+    shape = shapes.outline([(-half, 0), (-half, -depth)], [(half, 0), (half, -depth)])
+    corners = shapes.MAP + np.array([(0, 0, 0), (size[0], 0, 0), (*size, 0), (0, size[1], 0)])
+    sections, before = [], 0.0
+    for k in range(4):
+        leg = corners[(k + 1) % 4] - corners[k]
+        length = float(np.linalg.norm(leg))
+        along = leg / length
+        up = np.array([0.0, 0.0, 1.0])
+        for s in np.arange(
+            math.ceil((before - start) / spacing) * spacing + start, before + length - 1e-9, spacing
+        ):
+            frame = SectionFrame.from_axes(corners[k] + (s - before) * along, np.cross(up, along), up)
+            sections.append(section(shape, s=float(s), frame=frame))
+        before += length
+    return sections, before
+
+
+@pytest.mark.parametrize(("spacing", "start"), [(0.01, 0.005), (0.01, 0.0), (0.007, 0.002), (0.05, 0.013)])
+def test_a_joint_round_a_panel_has_mitred_corners(spacing, start):
+    sections, length = perimeter(spacing, start)
+    mesh = loft(sections, ring=length)
+    assert not check_closed(mesh).is_self_intersecting()
+    assert mesh.bodies == 1
+    assert body(mesh).euler_number == 0
+    assert mesh.volume == pytest.approx((0.62 * 0.42 - 0.58 * 0.38) * 0.06, rel=1e-6)
+
+
+def test_two_legs_of_an_open_joint_have_a_mitre():
+    sections, _ = perimeter(0.01, 0.005)
+    legs = [s for s in sections if s.s < 1.0]
+    mesh = loft(legs)
+    assert not check_closed(mesh).is_self_intersecting()
+    # From 5 mm behind the first corner to 5 mm before the third, 20 mm wide, mitred once.
+    assert mesh.volume == pytest.approx((0.595 + 0.395) * 0.02 * 0.06, rel=1e-6)
+
+
+def test_a_corner_that_turns_out_of_the_plane():
+    """A joint that runs along a wall's face and then round its edge: the mouth turns with it."""
+    sections = []
+    for k in range(10):
+        at = np.add(shapes.MAP, (0, 0.01 * k - 0.095, 0))
+        sections.append(section(s=0.01 * k, frame=SectionFrame.from_axes(at, (-1, 0, 0), (0, 0, 1))))
+    for k in range(10):
+        at = np.add(shapes.MAP, (0, 0, -0.005 - 0.01 * k))
+        sections.append(section(s=0.1 + 0.01 * k, frame=SectionFrame.from_axes(at, (-1, 0, 0), (0, 1, 0))))
+    mesh = loft(sections)
+    assert not check_closed(mesh).is_self_intersecting()
+    # An angle section 25 deep: 95 along each face outside, less the square that both legs share.
+    assert mesh.volume == pytest.approx(0.025 * (0.095 * 0.025 + 0.095 * 0.025 - 0.025 * 0.025), rel=1e-6)
+
+
+def test_corners_of_wandering_panels_stay_closed():
+    rng = np.random.default_rng(6)
+    for _ in range(6):
+        designed, length = perimeter(float(rng.uniform(0.006, 0.03)), 0.003)
+        shape = shapes.outline(designed[0].side_a, designed[0].side_b)
+        poses = rng.normal(size=(len(designed), 6)) * np.tile([0.003, 0.002, 0.03], 2)
+        sections = [
+            section(shape, p[:3], p[3:], d.s, frame=d.frame) for d, p in zip(designed, poses, strict=True)
+        ]
+        check_closed(loft(sections, ring=length))

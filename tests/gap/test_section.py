@@ -107,7 +107,7 @@ def test_open_gaps_against_shapely(a, b, name):
 @settings(max_examples=100, deadline=None, derandomize=True)
 def test_touching_and_crossing_sides_against_the_whole_boards(a, b, push):
     """Open: the band from mouth to root line less both boards. Overlap: what both boards share."""
-    pose_a, pose_b = (push + a[0], 0.0, a[2]), (b[0], 0.0, b[2])
+    pose_a, pose_b = (push + a[0], 0.0, a[2] / 4), (b[0], 0.0, b[2] / 4)
     g = section(shapes.BUTT, pose_a, pose_b)
     solid_a, solid_b = boards(shapes.BUTT, pose_a, pose_b)
     band = shapely.convex_hull(shapely.MultiPoint([*g.side_a, *g.side_b]))

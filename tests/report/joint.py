@@ -82,6 +82,8 @@ def board_mesh(side: int, stations: list[Station]) -> TriangleMesh:
     ring = BOARDS[side].loops[0]
     ends = [stations[0].frame.to_world(ring), stations[-1].frame.to_world(ring)]
     n = len(ring)
-    faces = [(i, (i + 1) % n, n + i) for i in range(n)] + [((i + 1) % n, n + (i + 1) % n, n + i) for i in range(n)]
+    faces = [(i, (i + 1) % n, n + i) for i in range(n)] + [
+        ((i + 1) % n, n + (i + 1) % n, n + i) for i in range(n)
+    ]
     faces += [(0, 2, 1), (0, 3, 2), (4, 5, 6), (4, 6, 7)]
     return TriangleMesh.of(np.concatenate(ends), faces)
