@@ -206,7 +206,8 @@ def _add_elements(plotter: Any, scene: JointScene, view: View, origin: Array) ->
 def _add_skins(plotter: Any, scene: JointScene, view: View, origin: Array) -> None:
     import pyvista as pv
 
-    for n, rings in enumerate(scene.as_built):
+    for n, given in enumerate(scene.as_built):
+        rings = [_open_ring(ring) for ring in given]
         faces: list[int] = []
         start = np.cumsum([0, *(len(ring) for ring in rings)])
         for k, (here, there) in enumerate(itertools.pairwise(rings)):
@@ -234,6 +235,11 @@ def _add_skins(plotter: Any, scene: JointScene, view: View, origin: Array) -> No
         )
         closed = [np.concatenate([ring, ring[:1]]) for ring in rings if len(ring)]
         _add_polylines(plotter, closed, origin, (SIDE_A, SIDE_B)[n % 2], 1.0)
+
+
+def _open_ring(ring: Array) -> Array:
+    """A ring without its first vertex at the end again."""
+    return ring[:-1] if len(ring) > 1 and np.array_equal(ring[0], ring[-1]) else ring
 
 
 def _add_lines(plotter: Any, scene: JointScene, origin: Array) -> None:

@@ -200,7 +200,6 @@ def test_no_window_without_a_display(stations, monkeypatch):
 def test_rendering_says_nothing_on_stderr(tmp_path):
     code = (
         "import numpy as np; from bimfit.report.scene import *; "
-    clear = View(opacity=0.3, size=(600, 400))
         f"render_joint({str(tmp_path / 'a.png')!r}, JointScene(points=np.random.default_rng(0).random((50, 3))), "
         "View(size=(200, 150)))"
     )
