@@ -117,7 +117,7 @@ def ray_enters(origins: Array, directions: Array, low: ArrayLike, high: ArrayLik
     origins, directions : ndarray, shape (m, d)
     low, high : array_like, shape (d,)
     """
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         a = (np.asarray(low, float) - origins) / directions
         b = (np.asarray(high, float) - origins) / directions
     # a ray within a face plane of the box gives 0 / 0: no limit from that slab

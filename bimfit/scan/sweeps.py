@@ -71,7 +71,7 @@ def _anchor(o: Array, d: Array, r: Array, grid: StationGrid, reach: float) -> tu
     crosses = np.zeros(len(o), bool)
     for _ in range(2 if grid.straight else 5):  # the frame decides the crossing, the crossing the frame
         lean = np.einsum("ij,ij->i", d, grid.v[k])
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             t = np.einsum("ij,ij->i", grid.origins[k] - o, grid.v[k]) / lean
         crosses = (np.abs(lean) > _FLAT) & (t > 0.0)
         p = np.where(crosses[:, None], o + d * np.where(crosses, t, 0.0)[:, None], hits)
