@@ -309,7 +309,7 @@ class Emulator:
         self._out.append((-math.inf, half))
         start = seen = time.monotonic()
         # Bytes pass through a buffer of the kernel that cannot be asked, hence some quiet time at the end.
-        while time.monotonic() < min(seen + 0.01, start + 1.0):
+        while time.monotonic() < min(seen + 0.05, start + 5.0) and not self._stop.is_set():
             self._write(math.inf)
             if self._out or self._unread():
                 seen = time.monotonic()

@@ -224,8 +224,12 @@ def _belongs(echo: bytes, rest: list[bytes]) -> bool:
 def _damaged(lines: list[bytes], why: str) -> Damaged:
     data = b"\n".join(lines)
     echo = bool(re.search(rb"[MG][DS]\d{10}", data))
-    scan = echo or b"\n99b" in data or any(len(line) == LINE + 1 for line in lines)
+    scan = echo or b"\n99b" in data or any(_is_data(line) for line in lines)
     return Damaged(why, data[:200], scan, echo)
+
+
+def _is_data(line: bytes) -> bool:
+    return len(line) == LINE + 1 and checksum(line[:-1]) == line[-1]
 
 
 def fields(reply: Reply) -> dict[str, str]:
