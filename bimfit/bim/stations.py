@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -23,6 +24,7 @@ UNIFORM = 1e-6
 """Sections that differ by no more than this are one, m."""
 REACH = FitConfig.reach
 """How much of the components is kept around the gap unless the caller says otherwise, m."""
+_MEMORY = 8  # distinct cuts of a joint that are compared with the next
 _WIDE = 0.05  # a gap this much beyond twice the joint's usual width is a missing component, m
 
 
@@ -95,7 +97,25 @@ def design_section(
         The origin is midway between the mouth corners; None where a component is missing, or where
         nothing of A faces B.
     """
-    whole = cut(element_a.mesh, rough), cut(element_b.mesh, rough)
+    settled = _settled((cut(element_a.mesh, rough), cut(element_b.mesh, rough)), reach)
+    return None if settled is None else _section(s, rough, settled)
+
+
+@dataclass(frozen=True)
+class _Settled:
+    """A section whose frame is settled: where in the rough frame its origin lies, and the rest in its own."""
+
+    origin: Array
+    components: tuple[Profile, Profile]
+    gap: GapOutline
+
+
+def _section(s: float, rough: SectionFrame, settled: _Settled) -> JointSection:
+    frame = SectionFrame(rough.to_world(settled.origin), rough.u, rough.v, rough.n)
+    return JointSection(float(s), frame, settled.components, settled.gap)
+
+
+def _settled(whole: tuple[Profile, Profile], reach: float) -> _Settled | None:
     if whole[0].empty or whole[1].empty:
         return None
     outline = trace_gap(*whole)
@@ -109,8 +129,7 @@ def design_section(
     to_gap = Pose2D(-float(middle[0]), -float(middle[1]))
     window = (float(low[0]), float(low[1])), (float(high[0]), float(high[1]))
     a, b = (clip_window(profile.moved(to_gap), *window) for profile in whole)
-    frame = SectionFrame(rough.to_world(middle), rough.u, rough.v, rough.n)
-    return JointSection(float(s), frame, (a, b), gap)
+    return _Settled(middle, (a, b), gap)
 
 
 def design_sections(
@@ -118,8 +137,7 @@ def design_sections(
 ) -> tuple[JointSection, ...]:
     """Cut a joint's elements at every station.
 
-    Where the section is the same along the joint, within 1 um, the *same* Profile and GapOutline objects are
-    returned for every station, so that what is built from them can be built once.
+    Where neighbouring sections are the same within 1 um, the *same* Profile and GapOutline objects are returned, so that what is built from them can be built once.
 
     Parameters
     ----------
@@ -144,11 +162,20 @@ def design_sections(
         When an element of the joint is not there.
     """
     a, b = (_element(elements, guid) for guid in joint.elements)
-    found = [
-        section
-        for s in np.asarray(stations, float).reshape(-1)
-        if (section := design_section(a, b, joint.path.rough_frame(float(s)), float(s), reach)) is not None
-    ]
+    known: list[tuple[tuple[Profile, Profile], _Settled | None]] = []
+    found = []
+    for s in np.asarray(stations, float).reshape(-1).tolist():
+        rough = joint.path.rough_frame(s)
+        whole = cut(a.mesh, rough), cut(b.mesh, rough)
+        # along a straight joint most cuts are alike: what follows from them is worked out once
+        alike = (k for k in reversed(known[-_MEMORY:]) if _same_pair(k[0], whole))
+        latest = next(alike, None)
+        if latest is None:
+            latest = whole, _settled(whole, reach)
+            known.append(latest)
+        settled = latest[1]
+        if settled is not None:
+            found.append(_section(s, rough, settled))
     if not found:
         return ()
     widths = np.array([_width(section.gap) for section in found])
@@ -184,7 +211,7 @@ def _shared(sections: Sequence[JointSection]) -> tuple[JointSection, ...]:
     out = []
     for section in sections:
         a, b = (_known(known, own) for known, own in zip(profiles, section.components, strict=True))
-        gap = next((g for g in reversed(gaps) if _same_gap(g, section.gap)), None)
+        gap = next((g for g in reversed(gaps[-_MEMORY:]) if _same_gap(g, section.gap)), None)
         if gap is None:
             gap = section.gap
             gaps.append(gap)
@@ -193,11 +220,15 @@ def _shared(sections: Sequence[JointSection]) -> tuple[JointSection, ...]:
 
 
 def _known(known: list[Profile], own: Profile) -> Profile:
-    for profile in reversed(known):
+    for profile in reversed(known[-_MEMORY:]):
         if same_profile(profile, own):
             return profile
     known.append(own)
     return own
+
+
+def _same_pair(p: tuple[Profile, Profile], q: tuple[Profile, Profile]) -> bool:
+    return same_profile(p[0], q[0]) and same_profile(p[1], q[1])
 
 
 def same_profile(p: Profile, q: Profile, tolerance: float = UNIFORM) -> bool:
@@ -213,9 +244,9 @@ def _same_loop(p: Array, q: Array, flags_p: ArrayLike, flags_q: ArrayLike, toler
     if len(p) != len(q):
         return False
     shift = int(np.argmin(np.linalg.norm(q - p[0], axis=1)))
-    if np.abs(np.roll(q, -shift, axis=0) - p).max() > tolerance:
-        return False
-    return bool(np.array_equal(np.roll(flags_q, -shift), flags_p))
+    if shift:
+        q, flags_q = np.roll(q, -shift, axis=0), np.roll(flags_q, -shift)
+    return bool(np.abs(q - p).max() <= tolerance) and bool(np.array_equal(flags_q, flags_p))
 
 
 def _same_gap(g: GapOutline, h: GapOutline) -> bool:

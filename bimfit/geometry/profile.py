@@ -52,7 +52,8 @@ class Profile:
         """Directed edges, shape (n, 2, 2): edge, end, coordinate."""
         if not self.loops:
             return np.zeros((0, 2, 2))
-        return np.concatenate([np.stack([loop, np.roll(loop, -1, axis=0)], axis=1) for loop in self.loops])
+        ends = [np.concatenate([loop[1:], loop[:1]]) for loop in self.loops]
+        return np.stack([np.concatenate(self.loops), np.concatenate(ends)], axis=1)
 
     @cached_property
     def normals(self) -> Array:

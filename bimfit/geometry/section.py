@@ -233,8 +233,7 @@ def _tidy(loops: list[Array]) -> tuple[Array, ...]:
     out = []
     for loop in loops:
         first = np.lexsort((loop[:, 1], loop[:, 0]))[0]  # an extreme vertex is a corner
-        ring = np.roll(loop, -int(first), axis=0)
-        line = shapely.LineString(np.vstack([ring, ring[:1]]))
+        line = shapely.LineString(np.concatenate([loop[first:], loop[: first + 1]]))
         slim = shapely.get_coordinates(line.simplify(STRAIGHT, preserve_topology=False))[:-1]
         if len(slim) > 2 and abs(signed_area(slim)) > MIN_AREA:
             out.append(slim)
@@ -245,8 +244,9 @@ def _as_shapely(profile: Profile) -> Any:
     import shapely
 
     # Greatest first: a hole comes after what it is cut from, and an island in it after the hole.
-    shape: Any = shapely.Polygon()
-    for loop in sorted(profile.loops, key=lambda loop: -abs(signed_area(loop))):
+    first, *others = sorted(profile.loops, key=lambda loop: -abs(signed_area(loop)))
+    shape: Any = shapely.Polygon(first)
+    for loop in others:
         join = shapely.union if signed_area(loop) > 0.0 else shapely.difference
         shape = join(shape, shapely.polygons(loop))
     return shape
