@@ -3,7 +3,7 @@
 Beams come sorted by pseudo-angle within groups of one origin each, as arrays:
 
 ``p``      pseudo-angle of the direction in the group's own axes, ascending within a group
-``d``      (n, 2) unit directions;  ``r`` (n,) ranges, negative where nothing came back
+``d``      (2, n) unit directions;  ``r`` (n,) ranges, negative where nothing came back
 ``start``  (g + 1,) first beam of every group;  ``eye`` (g, 4) origin and look direction of every group
 
 ``off`` (n,) is added to the log-likelihood whenever the beam is predicted to meet the component, and
@@ -23,6 +23,8 @@ from bimfit.geometry.pose import Array
 
 Ints = NDArray[np.int64]
 
+STEEP = 0.3
+NEVER = 1 << 40
 _JIT = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 
@@ -51,6 +53,21 @@ def _lower(p: Array, lo: int, hi: int, value: float) -> int:
 
 
 @njit(**_JIT)
+def _nearer(
+    nx: float, ny: float, c: float, e: int, dx: Array, dy: Array, begin: int, end: int, rho: Array, face: Ints
+) -> None:
+    """Lower rho over a stretch of beams; no branches, so that it becomes vector code."""
+    # slices from 0: a signed index that could be negative would keep LLVM from vectorising
+    x0, y0, rho0, face0 = dx[begin:end], dy[begin:end], rho[begin:end], face[begin:end]
+    for k in range(x0.shape[0]):
+        x = c / (nx * x0[k] + ny * y0[k])
+        old = rho0[k]
+        nearer = (x < old) & (x > 0.0)
+        rho0[k] = x if nearer else old
+        face0[k] = e if nearer else face0[k]
+
+
+@njit(**_JIT)
 def predict(
     edges: Array,
     cos: float,
@@ -73,6 +90,7 @@ def predict(
     rho, face : (n,)
         In and out: ranges and edge indices so far.
     """
+    dx, dy = d[0], d[1]
     for e in range(edges.shape[0]):
         nx = cos * edges[e, 4] - sin * edges[e, 5]
         ny = sin * edges[e, 4] + cos * edges[e, 5]
@@ -93,16 +111,9 @@ def predict(
                 i0, i1, j1 = _lower(p, s, t, low), _lower(p, s, t, high), s
             else:  # the edge lies across the cut behind the sensor
                 i0, i1, j1 = _lower(p, s, t, low), t, _lower(p, s, t, high)
-            for k in range(i0, i1):
-                x = c / (nx * d[k, 0] + ny * d[k, 1])
-                if 0.0 < x < rho[k]:
-                    rho[k] = x
-                    face[k] = e
-            for k in range(s, j1):
-                x = c / (nx * d[k, 0] + ny * d[k, 1])
-                if 0.0 < x < rho[k]:
-                    rho[k] = x
-                    face[k] = e
+            _nearer(nx, ny, c, e, dx, dy, i0, i1, rho, face)
+            if j1 > s:
+                _nearer(nx, ny, c, e, dx, dy, s, j1, rho, face)
 
 
 @njit(**_JIT)
@@ -141,10 +152,12 @@ def sort_beams(
 
 @njit(**_JIT)
 def log_table(amplitude: float, scale: float, table: Array) -> None:
-    """Fill ``table`` with log(1 + A exp(-q / 2)) at q = index * scale."""
-    for i in range(table.shape[0]):
-        table[i] = math.log(1.0 + amplitude * math.exp(-0.5 * i * scale))
-    table[table.shape[0] - 1] = 0.0
+    """Fill row 0 with log(1 + a) and row 1 with a / (1 + a), a = A exp(-q / 2), q = index * scale."""
+    for i in range(table.shape[1]):
+        a = amplitude * math.exp(-0.5 * i * scale)
+        table[0, i] = math.log(1.0 + a)
+        table[1, i] = a / (1.0 + a)
+    table[:, table.shape[1] - 2 :] = 0.0
 
 
 @njit(**_JIT)
@@ -159,30 +172,65 @@ def log_likelihood(
     off: Array,
     lim: Array,
     sigma: float,
+    spread: float,
     table: Array,
     scale: float,
     rho: Array,
     face: Ints,
 ) -> float:
-    """Log-likelihood at a pose (tx, ty, theta), as a difference from 'every beam misses'."""
+    """Log-likelihood at a pose (tx, ty, theta), as a difference from 'every beam misses'.
+
+    Where a face is nearly edge-on (|n.d| < STEEP) a range depends on the bearing more than on anything:
+    sigma^2 grows by the factor 1 + spread (rho tan i)^2 there, spread = (bearing's sd / sigma)^2.
+    """
     n = p.shape[0]
     for k in range(n):
         rho[k] = lim[k]
         face[k] = -1
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     predict(edges, cos, sin, pose[0], pose[1], p, d, start, eye, rho, face)
+    total: float = _total(edges, cos, sin, d, r, off, sigma, spread, table, scale, rho, face)
+    return total
+
+
+@njit(**_JIT)
+def _total(
+    edges: Array,
+    cos: float,
+    sin: float,
+    d: Array,
+    r: Array,
+    off: Array,
+    sigma: float,
+    spread: float,
+    table: Array,
+    scale: float,
+    rho: Array,
+    face: Ints,
+) -> float:
+    """Sum over covered beams of the residual's term and the cost of covering."""
     unit = 1.0 / (sigma * sigma * scale)
-    last = table.shape[0] - 1
+    last = table.shape[1] - 1.5
+    logs = table[0]
     total = 0.0
-    for k in range(n):
-        if face[k] < 0:
+    edge, steep, c2 = -1, False, 1.0
+    for k in range(r.shape[0]):
+        e = face[k]
+        if e < 0:
             continue
-        total += off[k]
-        if r[k] >= 0.0:
-            x = (r[k] - rho[k]) * (r[k] - rho[k]) * unit
-            if x < last:
-                i = int(x)
-                total += table[i] + (x - i) * (table[i + 1] - table[i])
+        if e != edge:
+            edge = e
+            nx = cos * edges[e, 4] - sin * edges[e, 5]
+            ny = sin * edges[e, 4] + cos * edges[e, 5]
+            nd = nx * d[0, k] + ny * d[1, k]
+            steep = nd > -STEEP
+            c2 = (rho[k] * nd) ** 2
+        z = r[k] - rho[k]
+        x = z * z * unit
+        if steep:
+            s2 = 1.0 + spread * rho[k] * rho[k] * (rho[k] * rho[k] / c2 - 1.0)
+            x = x / s2 + math.log(s2) / scale
+        total += logs[int(min(x, last) + 0.5)] + off[k]
     return total
 
 
@@ -198,8 +246,11 @@ def normal_equations(
     eye: Array,
     lim: Array,
     sigma: float,
-    amplitude: float,
-    graze: float,
+    lift: float,
+    grazes: int,
+    spread: float,
+    table: Array,
+    scale: float,
     rho: Array,
     face: Ints,
     H: Array,
@@ -207,8 +258,8 @@ def normal_equations(
 ) -> None:
     """Gauss-Newton system of the ranges in (tx, ty, theta * rs), rotation about the origin of ``edges``.
 
-    Weights a / (1 + a), a = A exp(-d^2 / 2). Returns that graze (|n.d| < graze) are left out: there a
-    range says next to nothing about the pose, but its Jacobian would claim the opposite.
+    Weights a / (1 + a), a = A exp(-(d^2 + lift) / 2), from row 1 of ``table``. A face met nearly edge-on
+    counts from ``grazes`` returns on: the Jacobian of a few claims more than they say.
     """
     n = p.shape[0]
     for k in range(n):
@@ -216,48 +267,63 @@ def normal_equations(
         face[k] = -1
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     predict(edges, cos, sin, pose[0], pose[1], p, d, start, eye, rho, face)
-    h00 = h01 = h02 = h11 = h12 = h22 = g0 = g1 = g2 = 0.0
+    H[:] = 0.0
+    g[:] = 0.0
     inv = 1.0 / sigma
+    unit = 1.0 / scale
+    last = table.shape[1] - 1.5
+    weights = table[1]
     for q in range(eye.shape[0]):
         ox, oy = eye[q, 0] - pose[0], eye[q, 1] - pose[1]
-        for k in range(start[q], start[q + 1]):
+        k, end = start[q], start[q + 1]
+        while k < end:
             e = face[k]
-            if e < 0 or r[k] < 0.0:
+            if e < 0:
+                k += 1
                 continue
-            z = (r[k] - rho[k]) * inv
-            if z * z > 60.0:
-                continue
+            # one stretch on one face: n.(a - o) is common to it, and so is the Jacobian's direction
             nx = cos * edges[e, 4] - sin * edges[e, 5]
             ny = sin * edges[e, 4] + cos * edges[e, 5]
-            nd = nx * d[k, 0] + ny * d[k, 1]
-            if nd > -graze:
+            nd = nx * d[0, k] + ny * d[1, k]
+            c = rho[k] * nd
+            steep = nd > -STEEP
+            first = k
+            lever, slope = (ny * ox - nx * oy) / rs, 1.0 / rs
+            s0 = s1 = s2 = t0 = t1 = 0.0
+            while k < end and face[k] == e:
+                z = (r[k] - rho[k]) * inv
+                x = min((z * z + lift) * unit, last)
+                # rho / c = 1 / (n.d)
+                f = rho[k] * inv / c
+                grow = 1.0
+                if steep:
+                    grow = 1.0 + spread * rho[k] * rho[k] * (rho[k] * rho[k] / (c * c) - 1.0)
+                    x = min((z * z / grow + lift) * unit + math.log(grow) * unit, last)
+                w = weights[int(x)] / grow
+                arm = lever + slope * rho[k] * (ny * d[0, k] - nx * d[1, k])
+                wf, wz = w * f * f, w * z * f
+                s0 += wf
+                s1 += wf * arm
+                s2 += wf * arm * arm
+                t0 += wz
+                t1 += wz * arm
+                k += 1
+            if steep and (k - first < grazes):
                 continue
-            a = amplitude * math.exp(-0.5 * z * z)
-            w = a / (1.0 + a)
-            f = inv / nd
-            px = ox + rho[k] * d[k, 0]
-            py = oy + rho[k] * d[k, 1]
-            j0, j1, j2 = nx * f, ny * f, (ny * px - nx * py) * f / rs
-            h00 += w * j0 * j0
-            h01 += w * j0 * j1
-            h02 += w * j0 * j2
-            h11 += w * j1 * j1
-            h12 += w * j1 * j2
-            h22 += w * j2 * j2
-            g0 += w * z * j0
-            g1 += w * z * j1
-            g2 += w * z * j2
-    H[0, 0] = h00
-    H[0, 1] = H[1, 0] = h01
-    H[0, 2] = H[2, 0] = h02
-    H[1, 1] = h11
-    H[1, 2] = H[2, 1] = h12
-    H[2, 2] = h22
-    g[0], g[1], g[2] = g0, g1, g2
+            H[0, 0] += nx * nx * s0
+            H[0, 1] += nx * ny * s0
+            H[1, 1] += ny * ny * s0
+            H[0, 2] += nx * s1
+            H[1, 2] += ny * s1
+            H[2, 2] += s2
+            g[0] += nx * t0
+            g[1] += ny * t0
+            g[2] += t1
+    H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
 
 
 @njit(**_JIT)
-def solve3(H: Array, g: Array, x: float) -> None:
+def solve3(H: Array, g: Array, x: Array) -> None:
     """Solve the symmetric positive definite 3 x 3 system H x = g."""
     a, b, c = H[0, 0], H[0, 1], H[0, 2]
     e, f, i = H[1, 1], H[1, 2], H[2, 2]
@@ -293,7 +359,8 @@ def slide(
     face = np.empty(n, np.int64)
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     unit = 1.0 / (sigma * sigma * scale)
-    last = table.shape[0] - 1
+    last = table.shape[1] - 1.5
+    logs = table[0]
     for i in range(steps.shape[0]):
         rho[:] = np.inf
         face[:] = -1
@@ -302,14 +369,10 @@ def slide(
         predict(edges_b, cos, sin, tx, ty, p, d, start, eye, rho, face)
         total = -0.5 * (steps[i, 0] ** 2 + steps[i, 1] ** 2) / (prior * prior)
         for k in range(n):
-            if face[k] < 0:
-                continue
-            total += off[k]
-            if r[k] >= 0.0:
-                x = (r[k] - rho[k]) * (r[k] - rho[k]) * unit
-                if x < last:
-                    j = int(x)
-                    total += table[j] + (x - j) * (table[j + 1] - table[j])
+            e = r[k] - rho[k]
+            x = min(e * e * unit, last) if face[k] >= 0 else last
+            total += logs[int(x + 0.5)]
+            total += off[k] if face[k] >= 0 else 0.0
         scores[i] = total
 
 
@@ -323,7 +386,8 @@ def _pose_at(q0: Array, axes: Array, s: float, w0: float, w1: float, rs: float, 
 
 @njit(**_JIT)
 def _log_prior(pose: Array, prior: Array) -> float:
-    return -0.5 * ((pose[0] / prior[0]) ** 2 + (pose[1] / prior[1]) ** 2 + (pose[2] / prior[2]) ** 2)
+    value: float = -0.5 * ((pose[0] / prior[0]) ** 2 + (pose[1] / prior[1]) ** 2 + (pose[2] / prior[2]) ** 2)
+    return value
 
 
 @njit(**_JIT)
@@ -338,7 +402,7 @@ def posterior(
     off: Array,
     lim: Array,
     sigma: float,
-    amplitude: float,
+    spread: float,
     table: Array,
     scale: float,
     prior: Array,
@@ -346,6 +410,7 @@ def posterior(
     window: float,
     least: float,
     cells: int,
+    draws: Array,
     mean: Array,
     cov: Array,
     info: Array,
@@ -356,6 +421,8 @@ def posterior(
 
     Parameters
     ----------
+    spread : float
+        See :func:`log_likelihood`.
     prior : (3,)
         Standard deviations of tx, ty (m) and theta (rad).
     begin : (3,)
@@ -364,70 +431,73 @@ def posterior(
         Greatest and least half width of the integration along the weak direction, m.
     cells : int
         Cells of the quadrature along the weak direction.
+    draws : (n, 4)
+        Student deviates and their log density, for posteriors that the quadrature cannot resolve.
     mean : (3,) out, cov : (3, 3) out
         In (tx, ty, theta * rs).
     info : (12,) out
         log evidence, sd and direction (3) of the weak axis from ranges alone, sd of it in the posterior,
-        rival mass, rival offset along the weak axis, log-likelihood at the mean, log-likelihood at its mode.
+        rival mass, rival offset along the weak axis, log-likelihood at the mean, log-posterior at its mode,
+        effective number of nodes, 1 where sampling replaced the quadrature.
     """
     n = p.shape[0]
     rho = np.empty(n)
     face = np.empty(n, np.int64)
-    H, g, x, pose = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
+    H, g, pose = np.empty((3, 3)), np.empty(3), np.empty(3)
     pinv = np.array([1.0 / prior[0] ** 2, 1.0 / prior[1] ** 2, 1.0 / (prior[2] * rs) ** 2])
-    graze = 0.3
+    args = (edges, rs, p, d, r, start, eye, off, lim, sigma, spread, table, scale, prior, pinv)
     q = np.array([begin[0], begin[1], begin[2] * rs])
-    for it in range(6):
-        m = 4.0 if it < 2 else (2.0 if it < 4 else 1.0)
-        pose[0], pose[1], pose[2] = q[0], q[1], q[2] / rs
-        normal_equations(
-            edges, pose, rs, p, d, r, start, eye, lim, m * sigma, amplitude / m, graze, rho, face, H, g
-        )
-        for i in range(3):
-            H[i, i] += 1.1 * pinv[i]
-            g[i] -= pinv[i] * q[i]
-        solve3(H, g, x)
-        q += x
-    pose[0], pose[1], pose[2] = q[0], q[1], q[2] / rs
-    normal_equations(edges, pose, rs, p, d, r, start, eye, lim, sigma, amplitude, graze, rho, face, H, g)
-    mixed = _two_orientations(edges, face, r)
-    raw = H.copy()
-    for i in range(3):
-        H[i, i] += pinv[i]
-    values, axes = np.linalg.eigh(H)
-    if axes[0, 0] < 0.0:
-        axes[:, 0] *= -1.0
-    sd = 1.0 / math.sqrt(values[0])
-    half = max(least, min(window, 6.0 * sd))
-    P2 = np.empty((2, 2))
-    for i in range(2):
-        for j in range(2):
-            P2[i, j] = (
-                axes[0, 1 + i] * axes[0, 1 + j] * pinv[0]
-                + axes[1, 1 + i] * axes[1, 1 + j] * pinv[1]
-                + axes[2, 1 + i] * axes[2, 1 + j] * pinv[2]
-            )
-    args = (edges, rs, p, d, r, start, eye, off, lim, sigma, amplitude, table, scale, prior, pinv)
-
-    # profile along the weak direction, from the middle outwards
+    _pilot(args, q, rho, face, H, g, pose)
     nodes = 25
     mid = nodes // 2
     w = np.zeros((nodes, 2))
-    best = np.full(nodes, -np.inf)
-    L = np.empty((2, 2))
-    step = half / mid
-    for j in range(nodes):
-        i = mid if j == 0 else (mid + (j + 1) // 2 if j % 2 == 1 else mid - j // 2)
-        if i > mid:
-            w[i] = w[i - 1]
-        elif i < mid:
-            w[i] = w[i + 1]
-        for _ in range(2):
-            _conditional_step(args, q, axes, (i - mid) * step, w[i], P2, graze, rho, face, H, g, pose, L)
-        _pose_at(q, axes, (i - mid) * step, w[i, 0], w[i, 1], rs, pose)
-        value = log_likelihood(edges, pose, p, d, r, start, eye, off, lim, sigma, table, scale, rho, face)
-        best[i] = value + _log_prior(pose, prior) - math.log(L[0, 0] * L[1, 1])
-    top = best.max()
+    best = np.empty(nodes)
+    raw, P2, axes = np.empty((3, 3)), np.empty((2, 2)), np.empty((3, 3))
+    mixed, step, top = False, 0.0, 0.0
+    for _ in range(4):
+        pose[0], pose[1], pose[2] = q[0], q[1], q[2] / rs
+        normal_equations(
+            edges,
+            pose,
+            rs,
+            p,
+            d,
+            r,
+            start,
+            eye,
+            lim,
+            sigma,
+            0.0,
+            NEVER,
+            spread,
+            table,
+            scale,
+            rho,
+            face,
+            H,
+            g,
+        )
+        mixed = _two_orientations(edges, face, r)
+        raw[:] = H
+        for i in range(3):
+            H[i, i] += pinv[i]
+        values, axes = np.linalg.eigh(H)
+        if axes[0, 0] < 0.0:
+            axes[:, 0] *= -1.0
+        step = max(least, min(window, 6.0 / math.sqrt(values[0]))) / mid
+        for i in range(2):
+            for j in range(2):
+                P2[i, j] = 0.0
+                for a in range(3):
+                    P2[i, j] += axes[a, 1 + i] * axes[a, 1 + j] * pinv[a]
+        top = _profile(args, q, axes, step, P2, rho, face, w, best)
+        i = int(np.argmax(best))
+        if 1 < i < nodes - 2 or abs(q[0]) + abs(q[1]) > 4.0 * window:
+            break
+        _pose_at(
+            q, axes, (i - mid) * step, w[i, 0], w[i, 1], 1.0, pose
+        )  # the best lies at an end: move there
+        q[:] = pose
     first, final = nodes, -1
     for i in range(nodes):
         if best[i] > top - 7.0:
@@ -435,12 +505,84 @@ def posterior(
             final = max(final, i)
     lo = (max(first - 1, 0) - mid) * step
     hi = (min(final + 1, nodes - 1) - mid) * step
-    _integrate(args, q, axes, lo, hi, cells, w, best, step, mid, top, P2, graze, mixed, mean, cov, info)
-    info[1] = 1.0 / math.sqrt(max(axes[:, 0] @ raw @ axes[:, 0], 1e-12))
+    _integrate(args, q, axes, lo, hi, cells, w, best, step, mid, top, P2, mixed, mean, cov, info)
+    if info[10] < 8.0:
+        for i in range(3):
+            for j in range(3):
+                H[i, j] = raw[i, j] + (pinv[i] if i == j else 0.0)
+        _sample(args, q, H, axes, draws, mean, cov, info)
+    info[1] = 1.0 / math.sqrt(max(_along(raw, axes), 1e-12))
     info[2], info[3], info[4] = axes[0, 0], axes[1, 0], axes[2, 0]
-    info[5] = math.sqrt(max(axes[:, 0] @ cov @ axes[:, 0], 0.0))
+    info[5] = math.sqrt(max(_along(cov, axes), 0.0))
     pose[0], pose[1], pose[2] = mean[0], mean[1], mean[2] / rs
-    info[8] = log_likelihood(edges, pose, p, d, r, start, eye, off, lim, sigma, table, scale, rho, face)
+    info[8] = log_likelihood(
+        edges, pose, p, d, r, start, eye, off, lim, sigma, spread, table, scale, rho, face
+    )
+
+
+@njit(**_JIT)
+def _along(m: Array, axes: Array) -> float:
+    """Quadratic form of the first axis."""
+    total = 0.0
+    for i in range(3):
+        for j in range(3):
+            total += axes[i, 0] * m[i, j] * axes[j, 0]
+    return total
+
+
+@njit(**_JIT)
+def _pilot(args: tuple[Any, ...], q: Array, rho: Array, face: Ints, H: Array, g: Array, pose: Array) -> None:
+    """Six annealed Gauss-Newton steps from q; q becomes the best place passed."""
+    edges, rs, p, d, r, start, eye, off, lim, sigma, spread, table, scale, prior, pinv = args
+    x, at = np.empty(3), q.copy()
+    top = -np.inf
+    for it in range(7):
+        pose[0], pose[1], pose[2] = at[0], at[1], at[2] / rs
+        value = log_likelihood(
+            edges, pose, p, d, r, start, eye, off, lim, sigma, spread, table, scale, rho, face
+        ) + _log_prior(pose, prior)
+        if value > top:
+            top = value
+            q[:] = at
+        if it == 6:
+            break
+        m = 4.0 if it < 2 else (2.0 if it < 4 else 1.0)
+        lift, s = 2.0 * math.log(m), m * sigma
+        normal_equations(
+            edges, pose, rs, p, d, r, start, eye, lim, s, lift, NEVER, spread, table, scale, rho, face, H, g
+        )
+        for i in range(3):
+            H[i, i] += 1.1 * pinv[i]
+            g[i] -= pinv[i] * at[i]
+        solve3(H, g, x)
+        at += x
+
+
+@njit(**_JIT)
+def _profile(
+    args: tuple[Any, ...], q: Array, axes: Array, step: float, P2: Array, rho: Array, face: Ints, w: Array,
+    best: Array,
+) -> float:  # fmt: skip
+    """Log marginal along the weak direction, from the middle node outwards; returns its maximum."""
+    edges, rs, p, d, r, start, eye, off, lim, sigma, spread, table, scale, prior, _ = args
+    H, g, pose, L = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((2, 2))
+    nodes = best.shape[0]
+    mid = nodes // 2
+    w[mid] = 0.0
+    for j in range(nodes):
+        i = mid if j == 0 else (mid + (j + 1) // 2 if j % 2 == 1 else mid - j // 2)
+        if i > mid:
+            w[i] = w[i - 1]
+        elif i < mid:
+            w[i] = w[i + 1]
+        for _ in range(2):
+            _conditional_step(args, q, axes, (i - mid) * step, w[i], P2, rho, face, H, g, pose, L)
+        _pose_at(q, axes, (i - mid) * step, w[i, 0], w[i, 1], rs, pose)
+        value = log_likelihood(
+            edges, pose, p, d, r, start, eye, off, lim, sigma, spread, table, scale, rho, face
+        )
+        best[i] = value + _log_prior(pose, prior) - math.log(L[0, 0] * L[1, 1])
+    return float(best.max())
 
 
 @njit(**_JIT)
@@ -465,7 +607,6 @@ def _conditional_step(
     s: float,
     w: Array,
     P2: Array,
-    graze: float,
     rho: Array,
     face: Ints,
     H: Array,
@@ -474,9 +615,11 @@ def _conditional_step(
     L: Array,
 ) -> None:
     """One Gauss-Newton step of w at fixed s; L becomes the Cholesky factor of its information."""
-    edges, rs, p, d, r, start, eye, _, lim, sigma, amplitude, _, _, _, pinv = args
+    edges, rs, p, d, r, start, eye, _, lim, sigma, spread, table, scale, _, pinv = args
     _pose_at(q, axes, s, w[0], w[1], rs, pose)
-    normal_equations(edges, pose, rs, p, d, r, start, eye, lim, sigma, amplitude, graze, rho, face, H, g)
+    normal_equations(
+        edges, pose, rs, p, d, r, start, eye, lim, sigma, 0.0, 2, spread, table, scale, rho, face, H, g
+    )
     pose[2] *= rs
     for i in range(3):
         g[i] -= pinv[i] * pose[i]
@@ -513,14 +656,13 @@ def _integrate(
     mid: int,
     top: float,
     P2: Array,
-    graze: float,
     mixed: bool,
     mean: Array,
     cov: Array,
     info: Array,
 ) -> None:
     """Moments by midpoints along u and Gauss-Hermite across (METHOD, section 4, step 8)."""
-    edges, rs, p, d, r, start, eye, off, lim, sigma, _, table, scale, prior, _ = args
+    edges, rs, p, d, r, start, eye, off, lim, sigma, spread, table, scale, prior, _ = args
     if mixed:
         xs = np.array([0.0, 1.3556261799742659, -1.3556261799742659, 2.8569700138728056, -2.8569700138728056])
         lw = np.log(
@@ -539,35 +681,42 @@ def _integrate(
     H, g, pose = np.empty((3, 3)), np.empty(3), np.empty(3)
     wc, L = np.empty(2), np.empty((2, 2))
     m = xs.shape[0]
-    h = (hi - lo) / cells
     values = np.empty(cells * m * m)
     points = np.empty((cells * m * m, 4))
-    count = 0
-    mode = -np.inf
-    for c in range(cells):
-        s = lo + (c + 0.5) * h
-        x = s / step + mid
-        i = min(max(int(x), 0), w.shape[0] - 2)
-        f = x - i
-        if max(best[i], best[i + 1]) < top - 12.0:
-            continue
-        wc[0] = w[i, 0] + f * (w[i + 1, 0] - w[i, 0])
-        wc[1] = w[i, 1] + f * (w[i + 1, 1] - w[i, 1])
-        _conditional_step(args, q, axes, s, wc, P2, graze, rho, face, H, g, pose, L)
-        base = math.log(2.0 * math.pi * h) - math.log(L[0, 0] * L[1, 1])
-        for a in range(m):
-            for b in range(m):
-                y1 = xs[b] / L[1, 1]
-                y0 = (xs[a] - L[1, 0] * y1) / L[0, 0]
-                _pose_at(q, axes, s, wc[0] + y0, wc[1] + y1, rs, pose)
-                value = log_likelihood(
-                    edges, pose, p, d, r, start, eye, off, lim, sigma, table, scale, rho, face
-                ) + _log_prior(pose, prior)
-                mode = max(mode, value)
-                values[count] = value + 0.5 * (xs[a] * xs[a] + xs[b] * xs[b]) + lw[a] + lw[b] + base
-                points[count, 0], points[count, 1], points[count, 2] = pose[0], pose[1], pose[2] * rs
-                points[count, 3] = s
-                count += 1
+    mass = np.empty(cells)
+    count, h, mode = 0, 0.0, -np.inf
+    for _ in range(4):
+        h = (hi - lo) / cells
+        count = 0
+        mode = -np.inf
+        for c in range(cells):
+            s = lo + (c + 0.5) * h
+            x = s / step + mid
+            i = min(max(int(x), 0), w.shape[0] - 2)
+            f = x - i
+            if max(best[i], best[i + 1]) < top - 12.0:
+                continue
+            wc[0] = w[i, 0] + f * (w[i + 1, 0] - w[i, 0])
+            wc[1] = w[i, 1] + f * (w[i + 1, 1] - w[i, 1])
+            _conditional_step(args, q, axes, s, wc, P2, rho, face, H, g, pose, L)
+            base = math.log(2.0 * math.pi * h) - math.log(L[0, 0] * L[1, 1])
+            for a in range(m):
+                for b in range(m):
+                    y1 = xs[b] / L[1, 1]
+                    y0 = (xs[a] - L[1, 0] * y1) / L[0, 0]
+                    _pose_at(q, axes, s, wc[0] + y0, wc[1] + y1, rs, pose)
+                    value = log_likelihood(
+                        edges, pose, p, d, r, start, eye, off, lim, sigma, spread, table, scale, rho, face
+                    ) + _log_prior(pose, prior)
+                    mode = max(mode, value)
+                    values[count] = value + 0.5 * (xs[a] * xs[a] + xs[b] * xs[b]) + lw[a] + lw[b] + base
+                    points[count, 0], points[count, 1], points[count, 2] = pose[0], pose[1], pose[2] * rs
+                    points[count, 3] = s
+                    count += 1
+        few, lo, hi = _narrowed(values, points, count, lo, h, mass)
+        if not few:
+            break
+        lo, hi = max(lo, -mid * step), min(hi, mid * step)
     peak = values[:count].max()
     total = 0.0
     mean[:] = 0.0
@@ -587,14 +736,49 @@ def _integrate(
             cov[i, j] += h * h / 12.0 * axes[i, 0] * axes[j, 0]
     info[0] = peak + math.log(total)
     info[9] = mode
-    _rival(values, points, count, total, lo, h, cells, info)
+    square = 0.0
+    across = np.zeros(2)
+    for k in range(count):
+        square += values[k] * values[k]
+        j = k % (m * m)
+        across[0] += values[k] / total * xs[j // m] ** 2
+        across[1] += values[k] / total * xs[j % m] ** 2
+    info[10] = total * total / square
+    if across.min() < 0.35:  # the conditional frame is far too wide: its nodes step over the posterior
+        info[10] = 0.0
+    _rival(values, points, count, total, h, info)
 
 
 @njit(**_JIT)
-def _rival(
-    values: Array, points: Array, count: int, total: float, lo: float, h: float, cells: int, info: Array
-) -> None:
+def _narrowed(
+    values: Array, points: Array, count: int, lo: float, h: float, mass: Array
+) -> tuple[bool, float, float]:
+    """Whether the mass lies in so few cells that they must be made finer, and the range to look at then.
+
+    A component whose two ends are both seen is pinned to a fraction of a beam's spacing, far less than
+    the range that the profile's nodes leave open.
+    """
+    peak = values[:count].max()
+    mass[:] = 0.0
+    for k in range(count):
+        i = min(int((points[k, 3] - lo) / h), mass.shape[0] - 1)
+        mass[i] += math.exp(values[k] - peak)
+    floor = 1e-3 * mass.max()
+    first, final, filled = mass.shape[0], -1, 0
+    for i in range(mass.shape[0]):
+        if mass[i] > floor:
+            first, final, filled = min(first, i), max(final, i), filled + 1
+    narrow = (final - first) < mass.shape[0] // 4
+    if not narrow:
+        return False, lo, lo + h * mass.shape[0]
+    return True, lo + (first - 1.0) * h, lo + (final + 2.0) * h
+
+
+@njit(**_JIT)
+def _rival(values: Array, points: Array, count: int, total: float, h: float, info: Array) -> None:
     """Mass more than 3 mm from the mode along the weak axis, and where most of it lies."""
+    cells = int((points[count - 1, 3] - points[0, 3]) / h + 0.5) + 1
+    lo = points[0, 3] - 0.5 * h
     mass = np.zeros(cells)
     for k in range(count):
         mass[min(int((points[k, 3] - lo) / h), cells - 1)] += values[k] / total
@@ -606,3 +790,102 @@ def _rival(
             centre += mass[c] * (c - top) * h
     info[6] = rival
     info[7] = centre / rival if rival > 0.0 else 0.0
+
+
+@njit(**_JIT)
+def _sample(
+    args: tuple[Any, ...], q: Array, H: Array, axes: Array, draws: Array, mean: Array, cov: Array, info: Array
+) -> None:
+    """Tempered importance sampling, for posteriors much narrower than the ranges' information says.
+
+    Returns that graze a deep face, or two visible ends, can pin a component to a sliver that lies askew
+    to the weak direction. The likelihood is raised to a power that grows to 1 as the proposal adapts.
+    """
+    edges, rs, p, d, r, start, eye, off, lim, sigma, spread, table, scale, prior, _ = args
+    n = draws.shape[0]
+    rho = np.empty(p.shape[0])
+    face = np.empty(p.shape[0], np.int64)
+    pose = np.empty(3)
+    centre = q.copy()
+    shape = 2.0 * np.linalg.inv(H)
+    x, target, before, w = np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(n)
+    power, calm = 0.0, 0
+    for _ in range(30):
+        L = np.linalg.cholesky(shape)
+        log_det = math.log(L[0, 0] * L[1, 1] * L[2, 2])
+        for i in range(n):
+            for a in range(3):
+                x[i, a] = centre[a]
+                for b in range(a + 1):
+                    x[i, a] += L[a, b] * draws[i, b]
+            pose[0], pose[1], pose[2] = x[i, 0], x[i, 1], x[i, 2] / rs
+            target[i] = log_likelihood(
+                edges, pose, p, d, r, start, eye, off, lim, sigma, spread, table, scale, rho, face
+            )
+            before[i] = _log_prior(pose, prior)
+        low, power = power, 1.0
+        for _ in range(12):
+            if _weights(target, before, draws, power, w) >= 0.12 * n:
+                break
+            power = low + 0.5 * (power - low)
+        effective = _weights(target, before, draws, power, w)
+        _moments(x, w, mean, cov)
+        centre[:] = mean
+        shape = 1.5 * cov + 0.01 * shape  # never degenerate, however few samples count
+        if power == 1.0:
+            calm += 1
+            if calm == 2:
+                break
+    peak = -np.inf
+    for i in range(n):
+        target[i] += before[i]
+        peak = max(peak, target[i])
+    total = 0.0
+    for i in range(n):
+        total += math.exp(target[i] - draws[i, 3] - peak)
+    info[0] = peak + math.log(total / n) + log_det
+    info[9] = peak
+    info[10] = effective
+    info[11] = 1.0
+    info[6] = 0.0
+    best, at = 0, -np.inf
+    for i in range(n):
+        if target[i] > at:
+            best, at = i, target[i]
+    for i in range(n):
+        away = 0.0
+        for a in range(3):
+            away += (x[i, a] - x[best, a]) * axes[a, 0]
+        if abs(away) > 0.003:
+            info[6] += w[i]
+            info[7] = away
+
+
+@njit(**_JIT)
+def _weights(target: Array, before: Array, draws: Array, power: float, w: Array) -> float:
+    """Normalised importance weights at a power of the target, and their effective number."""
+    top = -np.inf
+    for i in range(w.shape[0]):
+        w[i] = power * target[i] + before[i] - draws[i, 3]
+        top = max(top, w[i])
+    total = square = 0.0
+    for i in range(w.shape[0]):
+        w[i] = math.exp(w[i] - top)
+        total += w[i]
+        square += w[i] * w[i]
+    for i in range(w.shape[0]):
+        w[i] /= total
+    return total * total / square
+
+
+@njit(**_JIT)
+def _moments(x: Array, w: Array, mean: Array, cov: Array) -> None:
+    mean[:] = 0.0
+    cov[:] = 0.0
+    for i in range(w.shape[0]):
+        for a in range(3):
+            mean[a] += w[i] * x[i, a]
+    for i in range(w.shape[0]):
+        for a in range(3):
+            for b in range(3):
+                cov[a, b] += w[i] * (x[i, a] - mean[a]) * (x[i, b] - mean[b])

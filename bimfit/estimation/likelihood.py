@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,8 @@ from bimfit.geometry.slice import Beams
 
 Ints = NDArray[np.int64]
 _SHARE_FLOOR = 1e-3
-_TABLE = 512
+_TABLE = 2048
+_MISSING = -1e9
 
 
 @dataclass(frozen=True)
@@ -36,8 +38,8 @@ class BeamModel:
         A of log(1 + A exp(-d^2 / 2)): the odds of a return on the spot against an outlier there.
     miss : float
         log(e_m / (1 - e_m - e_o)): what a beam that returned nothing says against a face in its way.
-    table, scale : ndarray, shape (512,), and float
-        The logarithm above at d^2 = index * scale.
+    table, scale : ndarray, shape (2, 2048), and float
+        The logarithm above and a / (1 + a), a = A exp(-d^2 / 2), at d^2 = index * scale.
     outlier_share : float
         e_o.
     """
@@ -59,7 +61,7 @@ class BeamModel:
         e_m = max(sensor.miss_share, _SHARE_FLOOR)
         amplitude = max(1.0 - e_o - e_m, 0.05) * sensor.max_range / (e_o * s * math.sqrt(2.0 * math.pi))
         miss = math.log(e_m / max(1.0 - e_m - e_o, 0.05)) if sensor.missing_means_gap else 0.0
-        table = np.empty(_TABLE)
+        table = np.empty((2, _TABLE))
         scale = 2.0 * math.log(max(amplitude, 2.0) / 1e-3) / (_TABLE - 1)
         _kernels.log_table(amplitude, scale, table)
         return cls(s, amplitude, min(miss, 0.0), table, scale, e_o)
@@ -71,7 +73,7 @@ class BeamSet:
 
     Attributes
     ----------
-    p, d, r : ndarray, shape (n,), (n, 2), (n,)
+    p, d, r : ndarray, shape (n,), (2, n), (n,)
         Pseudo-angle, direction, range (negative where nothing came back).
     start, eye : ndarray, shape (g + 1,), (g, 4)
         First beam of every group of one origin; its origin and look direction.
@@ -91,7 +93,7 @@ class BeamSet:
         """Sort the beams of a slice."""
         o = np.ascontiguousarray(beams.origins, np.float64)
         d = np.ascontiguousarray(beams.directions, np.float64)
-        r = np.where(np.isfinite(beams.ranges), beams.ranges, -1.0)
+        r = np.where(np.isfinite(beams.ranges), beams.ranges, _MISSING)
         n = len(r)
         group = np.zeros(n, np.int64)
         if n and float(np.abs(o - o[0]).max()) > 1e-7:
@@ -103,7 +105,7 @@ class BeamSet:
         order = np.empty(n, np.int64)
         start = np.zeros(count + 1, np.int64)
         _kernels.sort_beams(o, d, group, count, eye, p, order, start)
-        return cls(p, np.ascontiguousarray(d[order]), np.ascontiguousarray(r[order]), start, eye, order)
+        return cls(p, np.ascontiguousarray(d[order].T), np.ascontiguousarray(r[order]), start, eye, order)
 
     def __len__(self) -> int:
         return len(self.p)
@@ -112,7 +114,12 @@ class BeamSet:
         """The beams for which ``keep`` holds; groups left empty stay."""
         before = np.concatenate([[0], np.cumsum(keep)]).astype(np.int64)
         return BeamSet(
-            self.p[keep], self.d[keep], self.r[keep], before[self.start], self.eye, self.order[keep]
+            self.p[keep],
+            np.ascontiguousarray(self.d[:, keep]),
+            self.r[keep],
+            before[self.start],
+            self.eye,
+            self.order[keep],
         )
 
     def moved_origin(self, pivot: Array) -> BeamSet:
@@ -121,11 +128,18 @@ class BeamSet:
         eye[:, :2] -= pivot
         return BeamSet(self.p, self.d, self.r, self.start, eye, self.order)
 
+    @cached_property
+    def spacing(self) -> float:
+        """Median angle between neighbouring beams, rad; 0 for fewer than two."""
+        step = np.abs(self.d[0, 1:] * self.d[1, :-1] - self.d[1, 1:] * self.d[0, :-1])
+        step = step[step > 1e-7]
+        return float(np.median(step)) if len(step) else 0.0
+
     @property
     def points(self) -> Array:
         """Where each beam ended (nonsense for misses), shape (n, 2)."""
         origin = np.repeat(self.eye[:, :2], np.diff(self.start), axis=0)
-        return np.asarray(origin + self.d * self.r[:, None])
+        return np.asarray(origin + (self.d * self.r).T)
 
 
 def edge_rows(profile: Profile, pose: Pose2D | None = None) -> Array:

@@ -254,7 +254,7 @@ def beside_artificial_ends(
         met = face >= 0
         out |= met & ~surface[which][np.maximum(face, 0)]
         origin = np.repeat(beams.eye[:, :2], np.diff(beams.start), axis=0)
-        hits = origin + beams.d * np.where(met, rho, 0.0)[:, None]
+        hits = origin + (beams.d * np.where(met, rho, 0.0)).T
         close = np.zeros(len(beams), bool)
         for a, b in edges[which][~surface[which]]:
             close |= met & (_distance(hits, a, b) < margin)

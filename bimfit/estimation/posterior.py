@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -12,6 +13,9 @@ from bimfit.estimation.likelihood import BeamModel, BeamSet
 from bimfit.geometry.pose import Array, Pose2D
 
 _CELLS = 24
+_NU = 6
+_BEARING = 0.05
+"""A beam's bearing is blurred by this share of the spacing: footprints and encoders are never points."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,8 @@ class Posterior:
         Probability more than 3 mm from the mode along the weak axis, and where it lies, m.
     radius : float
         Root mean square distance of the returns from the pivot, m.
+    ess : float
+        Effective number of nodes or samples behind the moments.
     """
 
     pose: Pose2D
@@ -69,6 +75,20 @@ class Posterior:
     rival_mass: float
     rival_offset: float
     radius: float
+    ess: float = float("nan")
+
+
+@lru_cache(maxsize=1)
+def _draws() -> Array:
+    """Student deviates (nu = 6) in three dimensions and their log density, shape (512, 4)."""
+    from scipy.special import gammaln
+    from scipy.stats import chi2, norm, qmc
+
+    uniform = qmc.Sobol(4, scramble=True, rng=np.random.default_rng(1)).random(512)
+    z = norm.ppf(uniform[:, :3]) * np.sqrt(_NU / chi2.ppf(uniform[:, 3:], _NU))
+    constant = gammaln((_NU + 3) / 2) - gammaln(_NU / 2) - 1.5 * math.log(_NU * math.pi)
+    log_density = constant - 0.5 * (_NU + 3) * np.log1p((z**2).sum(axis=1) / _NU)
+    return np.ascontiguousarray(np.column_stack([z, log_density]))
 
 
 def component_posterior(
@@ -109,11 +129,12 @@ def component_posterior(
         theta = begin.theta - start.theta
         shift = np.array([begin.u, begin.v]) - pivot - Pose2D(theta=theta).apply((local.u, local.v))
         first[:] = shift[0], shift[1], theta
+    spread = (_BEARING * beams.spacing / model.sigma) ** 2
     mean, cov, info = np.empty(3), np.empty((3, 3)), np.zeros(12)
     _kernels.posterior(
-        moved, radius, set_.p, set_.d, set_.r, set_.start, set_.eye, off, lim, model.sigma, model.amplitude,
+        moved, radius, set_.p, set_.d, set_.r, set_.start, set_.eye, off, lim, model.sigma, spread,
         model.table, model.scale, np.array([window.shift, window.shift, window.angle]), first,
-        window.reach, window.least, _CELLS, mean, cov, info,
+        window.reach, window.least, _CELLS, _draws(), mean, cov, info,
     )  # fmt: skip
     phi = mean[2] / radius
     turned = Pose2D(theta=phi).apply((local.u, local.v))
@@ -136,4 +157,5 @@ def component_posterior(
         rival_mass=float(info[6]),
         rival_offset=float(info[7]),
         radius=radius,
+        ess=float(info[10]),
     )
