@@ -200,8 +200,8 @@ def test_no_window_without_a_display(stations, monkeypatch):
 def test_rendering_says_nothing_on_stderr(tmp_path):
     code = (
         "import numpy as np; from bimfit.report.scene import *; "
-        f"render_joint({str(tmp_path / 'a.png')!r}, JointScene(points=np.random.default_rng(0).random((50, 3))), "
-        "View(size=(200, 150)))"
+        "points = np.random.default_rng(0).random((50, 3)); "
+        f"render_joint({str(tmp_path / 'a.png')!r}, JointScene(points=points), View(size=(200, 150)))"
     )
     env = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
     run = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=False)
