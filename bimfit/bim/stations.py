@@ -137,7 +137,8 @@ def design_sections(
 ) -> tuple[JointSection, ...]:
     """Cut a joint's elements at every station.
 
-    Where neighbouring sections are the same within 1 um, the *same* Profile and GapOutline objects are returned, so that what is built from them can be built once.
+    Where neighbouring sections are the same within 1 um, the *same* Profile and GapOutline objects are
+    returned, so that what is built from them can be built once.
 
     Parameters
     ----------
@@ -154,7 +155,8 @@ def design_sections(
     -------
     tuple of JointSection
         In the order of the stations. A station at which a component is missing, as where an opening reaches
-        the joint, is left out; :func:`missing_stations` names those.
+        the joint and the gap is far wider than ``joint.width`` (or, without one, than at most stations), is
+        left out; :func:`missing_stations` names those.
 
     Raises
     ------
@@ -179,7 +181,10 @@ def design_sections(
     if not found:
         return ()
     widths = np.array([_width(section.gap) for section in found])
-    kept = widths <= 2.0 * float(np.median(widths)) + _WIDE
+    # what is found across a far wider gap is not what the joint is between
+    designed = getattr(joint, "width", None)
+    usual = float(np.median(widths)) if designed is None else max(float(designed), 0.0)
+    kept = widths <= 2.0 * usual + _WIDE
     return _shared([section for section, keep in zip(found, kept, strict=True) if keep])
 
 

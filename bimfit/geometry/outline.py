@@ -13,7 +13,7 @@ from bimfit.geometry.profile import Profile, signed_area
 FACING = float(np.sin(np.radians(12.0)))
 """An edge faces the other component where its outward normal's u-component exceeds this."""
 _PARALLEL = float(np.cos(np.radians(5.0)))
-_CLASH = 0.010  # components that overlap by no more than this still have a gap outline, m
+_CLASH = 0.020  # components that overlap by no more than this still have a gap outline, m
 _LEDGE = 0.030  # ledges up to this long, or 1.5 times the facing depth, belong to a stepped joint, m
 _STEP_GAP = 0.200  # behind a ledge, the other component must be within this, m
 _SAME = 2e-6
@@ -113,7 +113,7 @@ def _facing_pair(a: _Boundary, b: _Boundary) -> tuple[int, int] | None:
     low = max(a.start[:, 1].min(), b.start[:, 1].min())
     high = min(a.start[:, 1].max(), b.start[:, 1].max())
     levels = levels[(levels >= low) & (levels <= high)]
-    best: tuple[float, int, int] | None = None
+    best: tuple[float, float, int, int] | None = None
     cells = np.stack([levels[:-1], levels[1:]], axis=1) if len(levels) > 1 else np.zeros((0, 2))
     cells = cells[cells[:, 1] - cells[:, 0] > _SAME]
     away = np.maximum(np.maximum(cells[:, 0], -cells[:, 1]), 0.0)
@@ -122,11 +122,11 @@ def _facing_pair(a: _Boundary, b: _Boundary) -> tuple[int, int] | None:
             break
         # Half way between neighbouring vertices no crossing grazes a corner.
         for left, right, i, j in _across(a, b, float(cells[k].mean())):
-            aside = max(left, -right, 0.0)
-            distance = float(np.hypot(aside, away[k]))
-            if best is None or distance < best[0]:
-                best = distance, i, j
-    return None if best is None else (best[1], best[2])
+            aside = max(min(left, right), -max(left, right), 0.0)
+            candidate = float(np.hypot(aside, away[k])), max(left - right, 0.0), i, j
+            if best is None or candidate < best:
+                best = candidate
+    return None if best is None else (best[2], best[3])
 
 
 def _across(a: _Boundary, b: _Boundary, level: float) -> list[tuple[float, float, int, int]]:

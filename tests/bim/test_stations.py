@@ -268,6 +268,22 @@ def test_stations_where_the_gap_opens_to_a_hole_are_left_out():
     np.testing.assert_allclose(missing_stations(stations, sections), [0.45, 0.55])
 
 
+def test_a_gap_far_wider_than_the_joint_is_none():
+    @dataclass(frozen=True)
+    class Wide(Pair):
+        width: float = 0.02
+
+    elements = {
+        "a": element_from_mesh(box((-0.5, 0, -0.1), (-0.2, 1.0, 0)), "a"),
+        "b": element_from_mesh(box((0.5, 0, -0.1), (0.9, 1.0, 0)), "b"),
+    }
+    path = JointPath.straight((0.3, 1, -0.05), (0.3, 0, -0.05), (1, 0, 0))
+    assert design_sections(elements, Wide(("a", "b"), path), [0.5], 0.2) == ()
+    # two that are named and known to be that far apart are another matter
+    (section,) = design_sections(elements, Wide(("a", "b"), path, 0.7), [0.5], 0.2)
+    assert section.gap.mouth[1][0] - section.gap.mouth[0][0] == pytest.approx(0.7)
+
+
 def test_a_tapering_gap_keeps_its_own_section_at_every_station():
     b = box((0.01, 0, -0.1), (0.2, 1.0, 0))
     vertices = b.vertices.copy()

@@ -239,6 +239,17 @@ def test_nothing_faces_anything(a, b):
     assert trace_gap(a, b) is None
 
 
+def test_a_thin_sheet_beside_the_gap_is_no_clash():
+    # B is 10 thick: its near face is across the gap, and its far face is not taken for an overlap with A
+    a = box(-200, -100, 0, 0)
+    b = box(5, -100, 15, 0)
+    found = trace_gap(a.moved(Pose2D(-0.001, 0.05)), b.moved(Pose2D(-0.001, 0.05)))
+    check(found, np.array([(-1, 50), (-1, -50)]) * MM, np.array([(4, 50), (4, -50)]) * MM)
+    found = trace_gap(a, box(-15, -100, 200, 0))
+    check(found, np.array([(0, 0), (0, -100)]) * MM, np.array([(-15, 0), (-15, -100)]) * MM)
+    assert trace_gap(a, box(-25, -100, 200, 0)) is None
+
+
 def test_corners_are_named_from_mouth_to_root():
     a, b, _, _ = wanted("square butt")
     found = trace_gap(a, b)
