@@ -38,7 +38,7 @@ def load_cached(digest: str) -> tuple[dict[str, Any], dict[int, TriangleMesh]] |
     """Description and meshes (by step id) of a model kept before; None without one or if it is damaged."""
     path = cache_path(digest)
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
             about = json.loads(arrays["about"].tobytes())
             vertices, faces = arrays["vertices"], arrays["faces"]
             ids, splits = arrays["ids"].tolist(), arrays["splits"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,7 +82,8 @@ def find_drafts(meshes: Sequence[TriangleMesh], eligible: NDArray[np.bool_], lim
     rows = [
         (key, leg) for key, leg in rows if leg.length >= limits.min_length and leg.depth >= limits.min_depth
     ]
-    return _finish(faces, rows) if rows else []
+    drafts = _finish(faces, rows) if rows else []
+    return [draft for draft in drafts if not draft.leg.groove or draft.kind in ("v-groove", "bevel")]
 
 
 Key = tuple[int, int, str, int]
@@ -173,7 +174,7 @@ def _add_grooves(
         np.flatnonzero((strips.gap_min <= _GROOVE_ROOT) & (strips.depth >= limits.min_depth))
     )
     for key, legs in _legs(faces, frames, strips, limits).items():
-        groups[key].extend(legs)
+        groups[key].extend(replace(leg, groove=True) for leg in legs)
 
 
 def _finish(faces: Faces, rows: Sequence[tuple[Key, Leg]]) -> list[Draft]:
@@ -203,7 +204,7 @@ def _finish(faces: Faces, rows: Sequence[tuple[Key, Leg]]) -> list[Draft]:
         np.array([spot[0] for spot in spots]),
         np.array([spot[1] for spot in spots]),
         np.array([spot[2] for spot in spots]),
-        depth,
+        depth + 2.0 * shape.prepared,
         stations.gap,
         np.array([key[3] for key, _ in rows]),
     )
@@ -211,10 +212,11 @@ def _finish(faces: Faces, rows: Sequence[tuple[Key, Leg]]) -> list[Draft]:
     out = []
     for k, (key, leg) in enumerate(rows):
         path = _path(leg, faces.origin)
+        whole = replace(leg, depth=leg.depth + float(shape.prepared[k]))
         sides = (bool(free[k, 0]), bool(free[k, 1]))
         if flip[k]:
             path, sides = path.flipped(), sides[::-1]
-        out.append(Draft(key[0], key[1], key[2], key[3], str(shape.kind[k]), leg, path, sides))
+        out.append(Draft(key[0], key[1], key[2], key[3], str(shape.kind[k]), whole, path, sides))
     return out
 
 

@@ -57,7 +57,7 @@ class Joint:
         land it is the gap between the lands.
     length, depth : float
         Along the joint and out of its mouth, m. The length is that of the faces that meet, which at corners
-        is less than the path's.
+        is less than the path's. The depth of a groove includes its prepared edges.
     path : JointPath
         The spine, midway in the gap and in its depth; u from A to B, v out of the default mouth.
     two_sided : bool

@@ -61,10 +61,13 @@ class Shape:
     kind : ndarray of str, shape (k,)
     opening : ndarray, shape (k,)
         Positive where the gap opens towards +v, negative towards -v, 0 where it does neither.
+    prepared : ndarray, shape (k,)
+        How much deeper the joint is than its facing faces, by the prepared edges beyond them, m.
     """
 
     kind: NDArray[np.str_]
     opening: Array
+    prepared: Array
 
 
 def classify(faces: Faces, stations: Stations, length: Array, area: Array) -> Shape:
@@ -83,21 +86,42 @@ def classify(faces: Faces, stations: Stations, length: Array, area: Array) -> Sh
         )
         top[:, :, e] = flat
     common_low, common_high = np.fmax(top[:, 0, 0], top[:, 1, 0]), np.fmin(top[:, 0, 1], top[:, 1, 1])
-    over = (
-        np.stack([common_low[:, None] - top[:, :, 0], top[:, :, 1] - common_high[:, None]], axis=2)
-        > _OVERHANG
-    )
     angle, turned = _corners(row, side, ends, slope, level, top)
     taper = np.arctan(slope[:, 1]) - np.arctan(slope[:, 0])
+    turned = np.where(_prepared(angle, taper), turned, 0.0)
+    over = _overhangs(top, angle, turned, stations.gap)
     depth = np.where(np.isfinite(common_high - common_low), common_high - common_low, stations.depth)
     kind = _name(over, angle, turned, taper, np.maximum(depth, 1e-6))
     kind[(stations.depth >= _SHEET_DEPTH) & (area >= _SHEET_AREA)] = "sheet"
     kind[(length < 1.2 * stations.depth) & (length < _PATCH)] = "patch"
-    prepared = np.where(angle > np.pi / 2.0 + _SLANT, turned, 0.0).sum(axis=1)
+    prepared = turned.sum(axis=1)
     opening = np.where(
         np.abs(taper) > _TAPER, np.sign(taper), np.sign(np.round(prepared[:, 1] - prepared[:, 0], 4))
     )
-    return Shape(kind, np.nan_to_num(opening))
+    deeper = np.where((kind == "v-groove") | (kind == "bevel"), turned.max(axis=1).sum(axis=1), 0.0)
+    return Shape(kind, np.nan_to_num(opening), deeper)
+
+
+def _prepared(angle: Array, taper: Array) -> NDArray[np.bool_]:
+    """Whether the edge beyond a face's end is a prepared one, and not the element's own side: (k, side, end).
+
+    Where an element is cut at a slant, one of its corners is sharp and the blunt one leads to its side.
+    """
+    blunt, sharp = angle > np.pi / 2.0 + _SLANT, angle < np.pi / 2.0 - _SLANT
+    plain = blunt & ~sharp[:, ::-1] & ~sharp[:, :, ::-1]
+    return np.asarray(plain & (np.abs(taper) <= _STEEP)[:, None, None])
+
+
+def _overhangs(top: Array, angle: Array, turned: Array, gap: Array) -> NDArray[np.bool_]:
+    """Which side's face goes on beyond the other's, at either end of the depth: shape (k, side, end).
+
+    A prepared edge counts with the face that it leads on from. Slanting ends of faces that lie apart are
+    shifted against each other, without one of them going on.
+    """
+    reach = np.array([-1.0, 1.0]) * top + turned
+    slant = np.abs(1.0 / np.tan(np.clip(angle, np.radians(25.0), np.radians(155.0)))).max(axis=(1, 2))
+    margin = _OVERHANG + np.abs(gap) * np.where(slant > np.tan(_SLANT), slant, 0.0)
+    return np.asarray(reach - reach[:, ::-1] > margin[:, None, None])
 
 
 def _name(
@@ -108,9 +132,8 @@ def _name(
     kind = np.full(k, "square-butt", "<U12")
     blunt, sharp = angle > np.pi / 2.0 + _SLANT, angle < np.pi / 2.0 - _SLANT
     kind[np.abs(taper) > _TAPER] = "tapered"
-    prepared = np.where(blunt & ~over, turned, 0.0)
-    both = prepared.min(axis=1).max(axis=1)
-    either = prepared.max(axis=(1, 2))
+    both = turned.min(axis=1).max(axis=1)
+    either = turned.max(axis=(1, 2))
     kind[either > 0.0] = "bevel"
     kind[both > _PREPARED_SHARE * (depth + both)] = "v-groove"
     steep = np.abs(taper) > _STEEP
@@ -119,9 +142,11 @@ def _name(
     kind[steep] = "bevel"
     kind[steep & np.all(np.abs(at_mouth - np.pi / 2.0) > np.radians(5.0), axis=1)] = "v-groove"
     for e in (0, 1):
-        kind[(sharp[:, 0, e] & blunt[:, 1, e]) | (blunt[:, 0, e] & sharp[:, 1, e])] = "scarf"
+        slanted = (sharp[:, 0, e] & blunt[:, 1, e]) | (blunt[:, 0, e] & sharp[:, 1, e])
+        kind[slanted & ~steep] = "scarf"
     for e in (0, 1):
-        kind[np.all(sharp[:, :, e], axis=1) & np.all(blunt[:, :, 1 - e], axis=1)] = "mitre"
+        slanted = np.all(sharp[:, :, e], axis=1) & np.all(blunt[:, :, 1 - e], axis=1)
+        kind[slanted & ~steep] = "mitre"
     a, b = over[:, 0], over[:, 1]
     count = a.sum(axis=1) + b.sum(axis=1)
     kind[count == 1] = "corner"

@@ -32,6 +32,8 @@ class Leg:
     legs : tuple of float
         Length of each run.
     closed : bool
+    groove : bool
+        Found as a pair of prepared edges without a root land.
     """
 
     points: Array
@@ -44,6 +46,7 @@ class Leg:
     area: float
     legs: tuple[float, ...] = ()
     closed: bool = False
+    groove: bool = False
 
     @property
     def way(self) -> Array:
@@ -300,6 +303,7 @@ def _chained(chain: Sequence[Leg], *, closed: bool) -> Leg:
         area=sum(leg.area for leg in chain),
         legs=tuple(x for leg in chain for x in leg.legs),
         closed=closed,
+        groove=chain[0].groove,
     )
 
 

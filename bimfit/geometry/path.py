@@ -20,7 +20,7 @@ _CHUNK = 1 << 15
 _NEWTON_STEPS = 4
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class JointPath:
     """A polyline with a section's axes on every leg.
 

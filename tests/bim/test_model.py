@@ -1,0 +1,367 @@
+"""The loader: every state that a file can be in ends in a model or in one clear line."""
+
+import random
+import zipfile
+from pathlib import Path
+
+import ifcopenshell
+import numpy as np
+import pytest
+
+from bimfit.bim import loading
+from bimfit.bim.cache import cache_path
+from bimfit.bim.georeference import GeoReference, map_scale
+from bimfit.bim.model import element_from_mesh, load_model, model_from_elements
+from bimfit.bim.source import nearest_schema, read_source
+from bimfit.errors import JointError, ModelError
+from bimfit.geometry.mesh import TriangleMesh
+
+ROOT = Path(__file__).resolve().parents[2]
+SAMPLES = ROOT / "ifc_samples"
+REAL = ROOT.parent / "shared" / "data" / "ifc"
+BUTT = SAMPLES / "square-butt-ifc4.ifc"
+
+needs_data = pytest.mark.skipif(not REAL.is_dir(), reason="../shared/data/ifc is not here")
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("BIMFIT_CACHE", str(tmp_path / "cache"))
+
+
+def altered(tmp_path, old, new, name="model.ifc", source=BUTT):
+    data = source.read_bytes()
+    assert old in data
+    (tmp_path / name).write_bytes(data.replace(old, new))
+    return tmp_path / name
+
+
+def test_elements_in_world_metres():
+    model = load_model(SAMPLES / "square-butt-ifc2x3.ifc")  # in millimetres
+    assert model.schema == "IFC2X3"
+    assert [(e.name, e.ifc_class, e.storey) for e in sorted(model.elements, key=lambda e: e.name)] == [
+        ("Board A", "IfcPlate", "Ground floor"),
+        ("Board B", "IfcPlate", "Ground floor"),
+    ]
+    np.testing.assert_allclose(model.bounds, [[-0.2125, 0, 0.025], [0.2125, 0.82, 0.05]], atol=1e-9)
+    for element in model.elements:
+        assert len(element.mesh.vertices) == 8  # merged
+        assert element.mesh.volume == pytest.approx(0.2 * 0.82 * 0.025)
+    assert [e.guid for e in model.elements] == sorted(e.guid for e in model.elements)
+
+
+def test_schemas_that_the_parser_refuses_are_read_as_the_nearest(tmp_path):
+    path = altered(tmp_path, b"'IFC4'", b"'IFC4X1'")
+    with pytest.raises(ifcopenshell.SchemaError):
+        ifcopenshell.open(path)
+    model = load_model(path)
+    assert len(model.elements) == 2
+    assert model.schema == "IFC4X1"
+    assert model.notes == ("schema IFC4X1 was read as IFC4X3_ADD2",)
+    names = {
+        "IFC2X3_FINAL": "IFC2X3",
+        "IFC4_ADD2": "IFC4",
+        "IFC4X3": "IFC4X3_ADD2",
+        "AP214": None,
+        "IFC5": None,
+    }
+    assert {name: nearest_schema(name) for name in names} == names
+
+
+def test_byte_order_mark_and_lower_case_schema(tmp_path):
+    path = altered(tmp_path, b"'IFC4'", b"'ifc4'")
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    model = load_model(path)
+    assert len(model.elements) == 2
+    assert "byte-order mark" in model.notes[0]
+
+
+def test_zip(tmp_path):
+    with zipfile.ZipFile(tmp_path / "model.ifczip", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.write(BUTT, "inner.ifc")
+    assert len(load_model(tmp_path / "model.ifczip").elements) == 2
+
+
+def test_hostile_archives_are_refused(tmp_path):
+    bomb = tmp_path / "bomb.ifczip"
+    with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("inner.ifc", b"ISO-10303-21;" + b" " * 30_000_000)
+    with pytest.raises(ModelError, match="far more than an IFC"):
+        load_model(bomb)
+    damaged = tmp_path / "damaged.ifczip"
+    damaged.write_bytes(bomb.read_bytes()[:5000])
+    with pytest.raises(ModelError, match="damaged archive"):
+        load_model(damaged)
+    two = tmp_path / "two.ifczip"
+    with zipfile.ZipFile(two, "w") as archive:
+        archive.write(BUTT, "a.ifc")
+        archive.write(BUTT, "b.ifc")
+    with pytest.raises(ModelError, match=r"2 \.ifc files"):
+        load_model(two)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (None, "cannot be read: No such file"),
+        (b"", "is empty"),
+        (b" \n ", "is empty"),
+        (b"x,y,z\n1,2,3\n", "not an IFC file"),
+        (b"\x00\x01\x02" * 500, "not an IFC file"),
+        (b'<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]><ifcXML/>', "is XML"),
+        (b'{"type": "ifcJSON"}', "is JSON"),
+        (b"ISO-10303-21;\nHEADER;\nENDSEC;\nDATA;\nENDSEC;\nEND-ISO-10303-21;\n", "names no schema"),
+        (b"ISO-10303-21;\nHEADER;\nFILE_SCHEMA(('AP214'));\nENDSEC;\n", "schema AP214"),
+    ],
+)
+def test_what_is_no_model_is_refused_in_one_line(tmp_path, content, says):
+    path = tmp_path / "model.ifc"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ModelError) as caught:
+        load_model(path)
+    line = str(caught.value)
+    assert says in line
+    assert str(path) in line
+    assert "\n" not in line
+
+
+def test_a_folder_is_refused(tmp_path):
+    with pytest.raises(ModelError, match="folder"):
+        load_model(tmp_path)
+
+
+def test_without_geometry(tmp_path):
+    file = ifcopenshell.open(BUTT)
+    for product in file.by_type("IfcPlate"):
+        product.Representation = None
+    file.write(str(tmp_path / "bare.ifc"))
+    with pytest.raises(ModelError, match="none of its 2 elements has a representation"):
+        load_model(tmp_path / "bare.ifc")
+    for product in file.by_type("IfcPlate"):
+        file.remove(product)
+    file.write(str(tmp_path / "none.ifc"))
+    with pytest.raises(ModelError, match="no building element with geometry"):
+        load_model(tmp_path / "none.ifc")
+
+
+def test_one_bad_body_is_skipped_and_listed(tmp_path):
+    file = ifcopenshell.open(BUTT)
+    solid = file.by_type("IfcExtrudedAreaSolid")[0]
+    solid.Depth = 1e300
+    file.write(str(tmp_path / "bad.ifc"))
+    model = load_model(tmp_path / "bad.ifc")
+    assert len(model.elements) == 1
+    assert len(model.skipped) == 1
+    assert model.skipped[0].reason
+    with pytest.raises(JointError, match="was left out"):
+        model.element(model.skipped[0].guid)
+
+
+def test_unknown_guid_names_the_nearest():
+    model = load_model(BUTT)
+    guid = model.elements[0].guid
+    with pytest.raises(JointError) as caught:
+        model.element(guid[:-1] + "!")
+    assert guid in str(caught.value)
+    assert model.element(guid) is model.elements[0]
+
+
+def test_parts_stand_for_their_whole(tmp_path):
+    file = ifcopenshell.open(BUTT)
+    whole, part = file.by_type("IfcPlate")
+    file.create_entity(
+        "IfcRelAggregates", ifcopenshell.guid.new(), RelatingObject=whole, RelatedObjects=[part]
+    )
+    file.write(str(tmp_path / "parts.ifc"))
+    model = load_model(tmp_path / "parts.ifc")
+    assert [(e.guid, e.parent_guid) for e in model.elements] == [(part.GlobalId, whole.GlobalId)]
+    with pytest.raises(JointError, match="made of parts"):
+        model.element(whole.GlobalId)
+
+
+def test_include_takes_guids_and_classes():
+    model = load_model(SAMPLES / "t-joint.ifc", include=["IfcMember"])
+    assert [e.ifc_class for e in model.elements] == ["IfcMember"]
+    guid = model.elements[0].guid
+    assert [e.guid for e in load_model(SAMPLES / "t-joint.ifc", include=[guid]).elements] == [guid]
+
+
+def test_cache_gives_the_same_and_survives_damage(monkeypatch):
+    first = load_model(BUTT)
+    path = cache_path(read_source(BUTT).digest)
+    assert path.is_file()
+
+    def forbidden(*_):
+        raise AssertionError("tessellated again")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("bimfit.bim.model.tessellate", forbidden)
+        second = load_model(BUTT)
+    for a, b in zip(first.elements, second.elements, strict=True):
+        assert (a.guid, a.name, a.storey) == (b.guid, b.name, b.storey)
+        np.testing.assert_array_equal(a.mesh.vertices, b.mesh.vertices)
+        np.testing.assert_array_equal(a.mesh.faces, b.mesh.faces)
+    whole = path.read_bytes()
+    for damage in (whole[: len(whole) // 2], b"", whole[:200] + b"\xff" * 60 + whole[260:]):
+        path.write_bytes(damage)
+        assert len(load_model(BUTT).elements) == 2
+
+
+def test_a_cache_that_cannot_be_written_is_no_error(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("BIMFIT_CACHE", str(tmp_path / "file" / "below"))
+    assert len(load_model(BUTT).elements) == 2
+    monkeypatch.setenv("BIMFIT_CACHE", str(tmp_path / "unused"))
+    load_model(BUTT, cache=False)
+    assert not (tmp_path / "unused").exists()
+
+
+GUARDED = """
+import json, os, sys, time
+import bimfit.bim.tessellate as child
+real = child._send_shape
+def strange(shape, number, out):
+    if number == {guilty}:
+        {act}
+    real(shape, number, out)
+child._send_shape = strange
+child.main()
+"""
+
+
+@pytest.mark.parametrize(("act", "reason"), [("os.abort()", "crashed"), ("time.sleep(60)", "took more than")])
+def test_a_kernel_that_crashes_or_hangs_loses_one_element(monkeypatch, act, reason):
+    file = ifcopenshell.open(SAMPLES / "t-joint.ifc")
+    guilty = file.by_type("IfcMember")[0]
+    script = GUARDED.format(guilty=guilty.id(), act=act)
+    real = loading.subprocess.Popen
+
+    def popen(command, **rest):
+        return real([command[0], "-c", script], **rest)
+
+    monkeypatch.setattr(loading.subprocess, "Popen", popen)
+    monkeypatch.setattr(loading, "_OPENING", 20.0)
+    model = load_model(SAMPLES / "t-joint.ifc", time_limit=2.0, cache=False)
+    assert [e.name for e in model.elements] == ["Base"]
+    assert [s.guid for s in model.skipped] == [guilty.GlobalId]
+    assert reason in model.skipped[0].reason
+
+
+def test_a_parser_that_crashes_is_one_clear_line(monkeypatch):
+    real = loading.subprocess.Popen
+    monkeypatch.setattr(
+        loading.subprocess,
+        "Popen",
+        lambda command, **rest: real([command[0], "-c", "import os; os.abort()"], **rest),
+    )
+    with pytest.raises(ModelError, match="crashed the parser"):
+        load_model(BUTT, cache=False)
+
+
+def test_mutated_files_end_in_a_model_or_one_line(tmp_path):
+    """Truncated, flipped, huge, NaN, cyclic: seeded; each is loaded in its own child process."""
+    rng = random.Random(7)
+    data = (SAMPLES / "lap.ifc").read_bytes()
+    outcomes = set()
+    for k in range(12):
+        broken = bytearray(data)
+        if k % 4 == 0:
+            broken = broken[: rng.randrange(300, len(broken))]
+        elif k % 4 == 1:
+            for _ in range(20):
+                broken[rng.randrange(900, len(broken))] ^= 1 << rng.randrange(7)
+        elif k % 4 == 2:
+            text = bytes(broken)
+            number = rng.choice([b"1E+400", b"-1E30", b"NAN", b"1.#QNAN", b"0."])
+            broken = bytearray(text.replace(rng.choice([b"820.", b"25.", b"31."]), number))
+        else:
+            lines = bytes(broken).split(b"\n")
+            refs = [i for i, line in enumerate(lines) if b"#" in line and b"=" in line]
+            for i in rng.sample(refs, 3):
+                head, _, tail = lines[i].partition(b"=")
+                lines[i] = head + b"=" + tail.replace(b"#1", b"#" + str(rng.randrange(1, 60)).encode())
+            broken = bytearray(b"\n".join(lines))
+        path = tmp_path / f"{k}.ifc"
+        path.write_bytes(bytes(broken))
+        try:
+            model = load_model(path, time_limit=5.0, cache=False)
+            assert all(np.all(np.isfinite(e.mesh.vertices)) for e in model.elements)
+            outcomes.add("model")
+        except ModelError as error:
+            assert "\n" not in str(error)
+            outcomes.add("refused")
+    assert outcomes == {"model", "refused"}
+
+
+def test_a_mesh_stands_in_for_an_element():
+    mesh = TriangleMesh.of(np.eye(3), [[0, 1, 2]])
+    a, b = element_from_mesh(mesh, "tube"), element_from_mesh(mesh, "plate")
+    assert len(a.guid) == 22
+    assert a.guid != b.guid
+    assert element_from_mesh(mesh, "tube").guid == a.guid
+    assert [e.guid for e in model_from_elements([a, b]).elements] == sorted([a.guid, b.guid])
+    with pytest.raises(ModelError, match="same GlobalId"):
+        model_from_elements([a, a])
+
+
+def test_map_conversion_there_and_back():
+    place = load_model(SAMPLES / "facade.ifc").georeference
+    assert place == GeoReference(
+        "EPSG:25832", 458657.21, 5438232.57, 112.4, pytest.approx(np.radians(27)), pytest.approx(1.0)
+    )
+    file = ifcopenshell.open(SAMPLES / "facade.ifc")
+    import ifcopenshell.util.geolocation as geolocation
+
+    point = np.array([10.0, 2.0, 3.0])
+    # the oracle works in project units, millimetres
+    east = geolocation.auto_xyz2enh(file, *(point * 1e3))
+    np.testing.assert_allclose(place.to_map(point), east, atol=1e-6)
+    np.testing.assert_allclose(place.to_project(place.to_map(point)), point, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("stated", "map_unit", "project_unit", "note"),
+    [
+        (0.001, 1.0, 0.001, ""),  # metres a millimetre: the standard's sense
+        (1.0, 1.0, 1.0, ""),
+        (1.0, 1.0, 0.001, "ratio of metres"),
+        (0.9996, 1.0, 0.001, "ratio of metres"),
+        (1000.0, 1.0, 0.001, "upside down"),
+        (7.0, 1.0, 1.0, "makes no sense"),
+    ],
+)
+def test_scale_is_read_in_the_sense_that_makes_sense(stated, map_unit, project_unit, note):
+    scale, said = map_scale(stated, map_unit, project_unit)
+    assert scale == pytest.approx(1.0, abs=1e-3)
+    assert note in said
+    assert bool(note) == bool(said)
+
+
+@needs_data
+def test_large_offsets_keep_their_precision():
+    model = load_model(REAL / "large_offset.ifc")
+    assert model.bounds[1].max() > 1e6
+    wall = model.element("3UltsdvPH0afI77DdCyC7z")
+    edges = np.linalg.norm(wall.mesh.triangles[:, 0] - wall.mesh.triangles[:, 1], axis=1)
+    known = [1.05, 0.955, 0.213]
+    known += [np.hypot(a, b) for a, b in ((1.05, 0.955), (1.05, 0.213), (0.955, 0.213))]
+    assert np.abs(edges[:, None] - known).min(axis=1).max() < 1e-8
+
+
+@needs_data
+def test_a_second_map_conversion_and_the_property_set_form():
+    place = load_model(REAL / "Duplex_A_20110907_georeferenced.ifc", include=["IfcSlab"]).georeference
+    assert place.crs == "EPSG:9897"
+    assert place.eastings == pytest.approx(76670.0)
+    assert "ePSet" in place.source
+
+
+def test_sizes_that_speak_for_a_wrong_unit_are_named(tmp_path):
+    path = altered(
+        tmp_path,
+        b"IFCSIUNIT(*,.LENGTHUNIT.,.MILLI.,.METRE.)",
+        b"IFCSIUNIT(*,.LENGTHUNIT.,$,.METRE.)",
+        source=SAMPLES / "lap.ifc",
+    )
+    assert any("is its unit millimetre" in note for note in load_model(path).notes)
