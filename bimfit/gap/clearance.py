@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from bimfit.gap.segments import Chain, Point, closing_lines_clear, nearest
+from bimfit.gap.segments import Chain, Point, closing_lines_clear, crossings, nearest, ring_area, to_chain
 from bimfit.geometry.pose import Array
 from bimfit.geometry.profile import signed_area
 
@@ -56,10 +56,15 @@ def measure(side_a: Chain, side_b: Chain) -> Clearance:
         From mouth to root. A's material lies to the right of its chain and B's to the left.
     """
     ring = [*side_a, *reversed(side_b)]
-    area = 0.5 * sum(p[0] * q[1] - p[1] * q[0] for p, q in zip(ring, [*ring[1:], ring[0]], strict=True))
+    area = ring_area(ring)
     if (len(side_a) - 1) * (len(side_b) - 1) <= _FEW:
         distance, at_a, at_b = nearest(side_a, side_b)
-        simple = distance > TOUCH and area > 0.0 and closing_lines_clear(side_a, side_b)
+        clear = closing_lines_clear(side_a, side_b)
+        simple = distance > TOUCH and area > 0.0 and clear
+        if clear and not simple:
+            found = _measure_once(side_a, side_b, distance)
+            if found is not None:
+                return found
     else:
         distance, at_a, at_b, simple = _measure_long(side_a, side_b)
         simple = simple and distance > TOUCH and area > 0.0
@@ -67,6 +72,53 @@ def measure(side_a: Chain, side_b: Chain) -> Clearance:
     if simple:
         return Clearance(True, area, 0.0, distance, (at_a, at_b), (outline,))
     return _measure_crossing(outline, np.array(side_a), np.array(side_b), distance, (at_a, at_b))
+
+
+def _measure_once(side_a: Chain, side_b: Chain, distance: float) -> Clearance | None:
+    """Sides that overlap all along, or cross once, in closed form; None where it is not as plain as that."""
+    if distance > TOUCH:
+        lobes = [([*side_a, *reversed(side_b)], side_a, side_b)]
+    else:
+        met = crossings(side_a, side_b)
+        if len(met) != 1 or _near_an_end(met[0], side_a, side_b):
+            return None
+        i, j, x = met[0]
+        upper_a, upper_b, lower_a, lower_b = (
+            side_a[: i + 1],
+            side_b[: j + 1],
+            side_a[i + 1 :],
+            side_b[j + 1 :],
+        )
+        lobes = [
+            ([*upper_a, x, *reversed(upper_b)], upper_a, upper_b),
+            ([x, *lower_a, *reversed(lower_b)], lower_a, lower_b),
+        ]
+    opened, overlap, deepest, closest = 0.0, 0.0, 0.0, ((0.0, 0.0), (0.0, 0.0))
+    parts = []
+    for ring, own_a, own_b in lobes:
+        size = ring_area(ring)
+        if size > TOUCH * TOUCH:
+            opened += size
+            parts.append((size, np.array(ring)))
+        elif size < 0.0:
+            overlap -= size
+            for own, other, swap in ((own_a, side_b, False), (own_b, side_a, True)):
+                for point in own:
+                    depth, foot = to_chain(point, other)
+                    if depth > deepest:
+                        here = (point[0], point[1])
+                        deepest, closest = depth, (foot, here) if swap else (here, foot)
+    if deepest <= TOUCH:
+        return None
+    parts.sort(key=lambda part: -part[0])
+    return Clearance(False, opened, overlap, -deepest, closest, tuple(ring for _, ring in parts))
+
+
+def _near_an_end(crossing: tuple[int, int, Point], side_a: Chain, side_b: Chain) -> bool:
+    """Whether sides cross so near to a vertex that rounding decides on which side of it."""
+    i, j, x = crossing
+    ends = (side_a[i], side_a[i + 1], side_b[j], side_b[j + 1])
+    return any(math.hypot(x[0] - p[0], x[1] - p[1]) < TOUCH for p in ends)
 
 
 def _measure_long(side_a: Chain, side_b: Chain) -> tuple[float, Point, Point, bool]:

@@ -67,6 +67,38 @@ def crosses(p: Sequence[float], q: Sequence[float], r: Sequence[float], s: Seque
     return True
 
 
+def crossings(side_a: Chain, side_b: Chain) -> list[tuple[int, int, Point]]:
+    """Where two chains cross: segment of A, segment of B, point."""
+    out: list[tuple[int, int, Point]] = []
+    for i in range(len(side_a) - 1):
+        p, q = side_a[i], side_a[i + 1]
+        for j in range(len(side_b) - 1):
+            r, s = side_b[j], side_b[j + 1]
+            if not crosses(p, q, r, s):
+                continue
+            du, dv, eu, ev = q[0] - p[0], q[1] - p[1], s[0] - r[0], s[1] - r[1]
+            det = du * ev - dv * eu
+            t = ((r[0] - p[0]) * ev - (r[1] - p[1]) * eu) / det if det != 0.0 else 0.0
+            out.append((i, j, (p[0] + t * du, p[1] + t * dv)))
+    return out
+
+
+def to_chain(point: Sequence[float], side: Chain) -> tuple[float, Point]:
+    """Distance of a point from a chain, and the chain's nearest point."""
+    feet = [_foot(point, side[k], side[k + 1]) for k in range(len(side) - 1)]
+    return min((math.hypot(point[0] - f[0], point[1] - f[1]), f) for f in feet)
+
+
+def ring_area(ring: Chain) -> float:
+    """Shoelace area of a closed ring, counter-clockwise positive."""
+    u, v = ring[0]
+    total = 0.0
+    for k in range(1, len(ring) - 1):
+        p, q = ring[k], ring[k + 1]
+        total += (p[0] - u) * (q[1] - v) - (p[1] - v) * (q[0] - u)
+    return 0.5 * total
+
+
 def _foot(point: Sequence[float], start: Sequence[float], end: Sequence[float]) -> Point:
     eu, ev = end[0] - start[0], end[1] - start[1]
     size = eu * eu + ev * ev

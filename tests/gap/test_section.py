@@ -12,6 +12,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bimfit.gap import clearance
 from bimfit.gap.section import gap_section
 from bimfit.geometry.pose import Pose2D
 
@@ -144,6 +145,23 @@ def test_a_bow_tie_is_half_open():
     # The deepest point is B's mouth corner, 4 mm behind A's face.
     assert math.isclose(g.width_narrowest, -0.004, rel_tol=1e-9)
     assert len(g.parts) == 1
+
+
+@given(a=small, b=small, push=st.floats(-0.002, 0.012), name=st.sampled_from(list(SHAPES)))
+@settings(max_examples=150, deadline=None, derandomize=True)
+def test_sides_that_cross_once_as_by_noding(a, b, push, name):
+    """The closed form for overlap and a single crossing against Shapely's noded faces."""
+    shape = SHAPES[name]
+    side_a = (Pose2D(push) @ Pose2D.from_array(a)).apply(shape.side_a)
+    side_b = Pose2D.from_array(b).apply(shape.side_b)
+    plain = clearance.measure(side_a.tolist(), side_b.tolist())
+    ring = np.concatenate([side_a, side_b[::-1]])
+    line_a, line_b = shapely.LineString(side_a), shapely.LineString(side_b)
+    noded = clearance._measure_crossing(ring, side_a, side_b, line_a.distance(line_b), plain.nearest)
+    assert plain.area == pytest.approx(noded.area, rel=1e-6, abs=1e-10)
+    assert plain.overlap_area == pytest.approx(noded.overlap_area, rel=1e-6, abs=1e-10)
+    assert plain.narrowest == pytest.approx(noded.narrowest, rel=1e-6, abs=1e-9)
+    assert [len(p) for p in plain.parts] == [len(p) for p in noded.parts]
 
 
 def test_a_bump_that_touches_leaves_two_parts():
