@@ -8,12 +8,10 @@ No ``fastmath``: it assumes that NaN does not exist.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 import numba as nb
 import numpy as np
-
-F = TypeVar("F", bound=Callable[..., Any])
 
 FULL = 255  # leaf value on the model itself
 LANE = 21  # bits of one of three sums that share a machine word
@@ -23,17 +21,19 @@ SHIFT_NODE = 20  # bits of one index in a node's code
 
 # slots of the state vector
 HEAP, BEST, BEST_CODE, EVALUATIONS, PHASE, FOUND, BOUND = 0, 1, 2, 3, 4, 5, 6
-STATE_SIZE = 8
+EXPANDED = 8  # from here on, nodes expanded of each level; slot 8 counts rows of leaves scored
+STATE_SIZE = 32
 # what a call of ``search`` ends with
 DONE, TOLERANCE, BUDGET, HEAP_FULL, FOUND_FULL = 0, 1, 2, 3, 4
 
 
-def jit(function: F) -> F:
+def jit(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile without the interpreter lock; cache on disk where some directory can be written."""
     try:
-        return nb.njit(nogil=True, cache=True)(function)  # type: ignore[no-any-return]
+        compiled: Callable[..., Any] = nb.njit(nogil=True, cache=True)(function)
     except RuntimeError:  # numba found no directory for its cache: a read-only installation
-        return nb.njit(nogil=True)(function)  # type: ignore[no-any-return]
+        compiled = nb.njit(nogil=True)(function)
+    return compiled
 
 
 # ---------------------------------------------------------------- tables
@@ -109,48 +109,47 @@ def block_table(leaf, bu, bv, slack, low_u, low_v, out):
 def affine_table(leaf, ru, rv, pad, shift, out):
     """Affine majorants: leaf[c + d] 2^shift <= A + gu du + gv dv for |du| <= ru, |dv| <= rv.
 
+    The slope is the window's least-squares slope times the one of a few factors that gives the least A.
     ``out`` (H + 2 pad, W + 2 pad) packs A (16 bits), gu + 128 and gv + 128 (8 bits each).
     """
+    rows, columns = out.shape
     height, width = leaf.shape
-    one = 1 << shift
     nu, nv = 2 * ru + 1, 2 * rv + 1
+    one = np.int32(1 << shift)
+    wide = np.zeros((rows + 2 * rv, columns + 2 * ru), np.int32)
+    wide[rv + pad : rv + pad + height, ru + pad : ru + pad + width] = leaf
     scale_u = one * 3.0 / (max(1, ru * (ru + 1)) * nu * nv)
     scale_v = one * 3.0 / (max(1, rv * (rv + 1)) * nu * nv)
-    if ru == 0:
-        scale_u = 0.0
-    if rv == 0:
-        scale_v = 0.0
-    for y in range(out.shape[0]):
-        for x in range(out.shape[1]):
-            i, j = y - pad, x - pad
-            i0, i1 = max(0, i - rv), min(height - 1, i + rv)
-            j0, j1 = max(0, j - ru), min(width - 1, j + ru)
-            sum_u, sum_v, top = 0, 0, 0
-            for a in range(i0, i1 + 1):
-                line = 0
-                for b in range(j0, j1 + 1):
-                    value = np.int64(leaf[a, b])
-                    line += value
-                    sum_u += value * (b - j)
-                    top = max(top, value)
-                sum_v += line * (a - i)
-            best_a, best_u, best_v = top * one, 0, 0
-            if top > 0:
-                for f in range(1, 6):
-                    gu = min(127, max(-127, int(np.rint(0.25 * f * scale_u * sum_u))))
-                    gv = min(127, max(-127, int(np.rint(0.25 * f * scale_v * sum_v))))
-                    if gu == 0 and gv == 0:
-                        continue
-                    # cells outside the table hold 0 and must be covered too
-                    least = -np.int64(1 << 40)
-                    if i - rv < 0 or i + rv >= height or j - ru < 0 or j + ru >= width:
-                        least = np.int64(abs(gu) * ru + abs(gv) * rv)
-                    for a in range(i0, i1 + 1):
-                        rest = gv * (a - i)
-                        for b in range(j0, j1 + 1):
-                            least = max(least, np.int64(leaf[a, b]) * one - gu * (b - j) - rest)
-                    if least < best_a:
-                        best_a, best_u, best_v = least, gu, gv
+    empty = (np.uint32(128) << np.uint32(16)) | (np.uint32(128) << np.uint32(24))
+    for y in range(rows):
+        for x in range(columns):
+            sum_u, sum_v, top = np.int32(0), np.int32(0), np.int32(0)
+            for a in range(nv):
+                row = wide[y + a, x : x + nu]
+                line = np.int32(0)
+                for b in range(nu):
+                    line = np.int32(line + row[b])
+                    sum_u = np.int32(sum_u + np.int32(row[b] * np.int32(b - ru)))
+                    top = max(top, row[b])
+                sum_v = np.int32(sum_v + np.int32(line * np.int32(a - rv)))
+            if top == 0:
+                out[y, x] = empty
+                continue
+            best_a, best_u, best_v = np.int32(top * one), np.int32(0), np.int32(0)
+            for f in range(2, 6):
+                gu = np.int32(min(127, max(-127, int(np.rint(0.25 * f * scale_u * sum_u)))))
+                gv = np.int32(min(127, max(-127, int(np.rint(0.25 * f * scale_v * sum_v)))))
+                if gu == 0 and gv == 0:
+                    continue
+                least = np.int32(-(1 << 30))
+                for a in range(nv):
+                    row = wide[y + a, x : x + nu]
+                    rest = np.int32(gv * np.int32(a - rv))
+                    for b in range(nu):
+                        value = np.int32(np.int32(row[b] * one) - np.int32(gu * np.int32(b - ru)))
+                        least = max(least, np.int32(value - rest))
+                if least < best_a:
+                    best_a, best_u, best_v = least, gu, gv
             word = np.uint32(best_a) | (np.uint32(best_u + 128) << np.uint32(16))
             out[y, x] = word | (np.uint32(best_v + 128) << np.uint32(24))
 
@@ -159,37 +158,41 @@ def affine_table(leaf, ru, rv, pad, shift, out):
 
 
 @jit
-def fill_cells(it, n, pu, pv, cosine, sine, start, cu, cv):
-    """Cells of all points at angle ``it`` and translation 0; ``pu``, ``pv`` in cells about the pivot.
+def fill_cells(cosine, sine, pu, pv, start, cu, cv):
+    """Cells of all points at one angle and translation 0; ``pu``, ``pv`` in cells about the pivot.
 
     ``start`` holds the pivot's cell coordinates and the ratio of the cells' sides.
     """
-    c, s = cosine[it], sine[it]
-    base = it * n
-    for k in range(n):
-        cu[base + k] = np.int32(np.floor(c * pu[k] - s * start[2] * pv[k] + start[0]))
-        cv[base + k] = np.int32(np.floor(s * start[3] * pu[k] + c * pv[k] + start[1]))
+    a, b = sine * start[2], sine * start[3]
+    for k in range(pu.shape[0]):
+        cu[k] = np.int32(np.floor(cosine * pu[k] - a * pv[k] + start[0]))
+        cv[k] = np.int32(np.floor(b * pu[k] + cosine * pv[k] + start[1]))
 
 
 @jit
-def score_box(base, n, cu, cv, weight, chunk, lanes, v0, nv, u0, nu, out):
+def score_box(base, n, cu, cv, weight, chunk, lanes, v0, nv, u0, nu, at, out):
     """Scores of nv x nu neighbouring translations at one angle, three along u in each word."""
     height, width = lanes.shape
     table = lanes.reshape(height * width)
+    own_u, own_v, cells = cu[base : base + n], cv[base : base + n], at[:n]
+    right, low, stride = np.int32(width - 1), np.int32(height - 1), np.int32(width)
     words = (nu + 2) // 3
     for i in range(nv):
+        shift_v = np.int32(v0 + i + 1)
         for m in range(words):
             left = 3 * m
+            shift_u = np.int32(u0 + left + 3)
+            for p in range(n):
+                x = min(max(np.int32(own_u[p] + shift_u), np.int32(0)), right)
+                y = min(max(np.int32(own_v[p] + shift_v), np.int32(0)), low)
+                cells[p] = np.int32(np.int32(y * stride) + x)
             s0, s1, s2 = np.int64(0), np.int64(0), np.int64(0)
-            shift_u, shift_v = u0 + left + 3, v0 + i + 1
             k = 0
             while k < n:
                 stop = min(n, k + chunk)
                 word = np.uint64(0)
                 for p in range(k, stop):
-                    x = min(max(cu[base + p] + shift_u, 0), width - 1)
-                    y = min(max(cv[base + p] + shift_v, 0), height - 1)
-                    word += table[np.uint64(y * width + x)] * weight[p]
+                    word += table[np.uint64(cells[p])] * weight[p]
                 s0 += np.int64(word & np.uint64(LANE_SUM))
                 s1 += np.int64((word >> np.uint64(LANE)) & np.uint64(LANE_SUM))
                 s2 += np.int64(word >> np.uint64(2 * LANE))
@@ -261,31 +264,33 @@ def keeps(bound, code, cut, cut_code):
 def ensure_cells(it, n, pu, pv, cosine, sine, start, cu, cv, have):
     """Compute the cells at angle ``it`` unless they are there."""
     if have[it] == 0:
-        fill_cells(it, n, pu, pv, cosine, sine, start, cu, cv)
+        own = slice(it * n, it * n + n)
+        fill_cells(cosine[it], sine[it], pu, pv, start, cu[own], cv[own])
         have[it] = 1
 
 
 @jit
-def merge_blocks(t, level, n, size, cu, cv, weight, classes, row, lists, counts, slot):
+def merge_blocks(cu, cv, weight, classes, bu, bv, at, lists, counts, slot):
     """Blocks that the points fall into at one (level, angle), neighbours merged; kept in ``lists``.
 
-    Rows of ``lists``: block in u, block in v, slack class, weight.
+    Rows of ``lists``: block in u, block in v, slack class, weight. Dividing by multiplication is exact
+    here: a cell's middle is half a cell from any border, far above rounding.
     """
-    bu, bv, bt = size[level, 0], size[level, 1], size[level, 2]
-    base = (t * bt + bt // 2) * n
+    n = cu.shape[0]
     first = slot * n
-    m = first - 1
-    last_u, last_v, last_c = np.int64(-(1 << 40)), np.int64(0), np.int64(0)
+    inverse_u, inverse_v = 1.0 / bu, 1.0 / bv
     for k in range(n):
-        x = np.int64(cu[base + k]) // bu
-        y = np.int64(cv[base + k]) // bv
-        c = np.int64(classes[row * n + k])
+        at[k] = np.int32(np.floor((cu[k] + 0.5) * inverse_u))
+        at[n + k] = np.int32(np.floor((cv[k] + 0.5) * inverse_v))
+    m = first - 1
+    last_u, last_v, last_c = np.int32(0), np.int32(0), np.int32(-1)
+    for k in range(n):
+        x, y, c = at[np.uint64(k)], at[np.uint64(n + k)], np.int32(classes[k])
         if x == last_u and y == last_v and c == last_c:
             lists[3, m] += np.int32(weight[k])
         else:
             m += 1
-            lists[0, m], lists[1, m], lists[2, m] = np.int32(x), np.int32(y), np.int32(c)
-            lists[3, m] = np.int32(weight[k])
+            lists[0, m], lists[1, m], lists[2, m], lists[3, m] = x, y, c, np.int32(weight[k])
             last_u, last_v, last_c = x, y, c
     counts[slot] = m - first + 1
 
@@ -330,31 +335,38 @@ def point_classes(n, pu, pv, qu, qv, eta, class_of, out):
 
 
 @jit
-def affine_classes(t, bt, n, cu, cv, class_of, out):
+def affine_classes(first, middle, bt, n, cu, cv, class_of, at, out):
     """Slack class of every point at one (level, angle) from the cells at the interval's very angles."""
-    middle = (t * bt + bt // 2) * n
     last = class_of.shape[0] - 1
+    mu, mv = cu[middle * n : middle * n + n], cv[middle * n : middle * n + n]
+    most = at[:n]
+    most[:] = 0
+    for i in range(first, first + bt):
+        ou, ov = cu[i * n : i * n + n], cv[i * n : i * n + n]
+        for k in range(n):
+            a, b = np.int32(ou[k] - mu[k]), np.int32(ov[k] - mv[k])
+            most[k] = max(most[k], a, np.int32(-a), b, np.int32(-b))
     for k in range(n):
-        slack = 0
-        for i in range(bt):
-            other = (t * bt + i) * n
-            slack = max(slack, abs(cu[other + k] - cu[middle + k]), abs(cv[other + k] - cv[middle + k]))
-        out[t * n + k] = class_of[min(slack, last)]
+        out[k] = class_of[np.uint64(min(most[k], last))]
 
 
 @jit
-def affine_pass(base, class_base, n, cu, cv, weight, du, dv, where, tables, classes, gu, gv, sums):
+def affine_pass(cu, cv, classes, weight, du, dv, where, tables, at, gu, gv, sums):
     """Sum of majorants at one pose: constants and slopes into ``sums``, weighted slopes a point kept.
 
-    ``where``: offset into ``tables``, rows, columns, rim.
+    All arrays run over the points; ``where``: offset into ``tables``, rows, columns, rim. Two loops, so
+    that the first becomes vector code.
     """
-    rows, columns, pad = where[1], where[2], where[3]
-    offset, stride = where[0], where[1] * where[2]
+    offset, rows, columns, pad = where[0], where[1], where[2], where[3]
+    right, low, stride = np.int32(columns - 1), np.int32(rows - 1), np.int32(rows * columns)
+    shift_u, shift_v, width = np.int32(du + pad), np.int32(dv + pad), np.int32(columns)
+    for k in range(cu.shape[0]):
+        x = min(max(np.int32(cu[k] + shift_u), np.int32(0)), right)
+        y = min(max(np.int32(cv[k] + shift_v), np.int32(0)), low)
+        at[k] = np.int32(np.int32(np.int32(y * width) + x) + np.int32(np.int32(classes[k]) * stride))
     total, total_u, total_v = np.int64(0), np.int64(0), np.int64(0)
-    for k in range(n):
-        x = min(max(np.int64(cu[base + k]) + du + pad, 0), columns - 1)
-        y = min(max(np.int64(cv[base + k]) + dv + pad, 0), rows - 1)
-        word = np.int64(tables[np.uint64(offset + classes[class_base + k] * stride + y * columns + x)])
+    for k in range(cu.shape[0]):
+        word = np.int64(tables[np.uint64(offset + at[k])])
         w = np.int64(weight[k])
         a = w * (((word >> 16) & 255) - 128)
         b = w * ((word >> 24) - 128)
@@ -367,18 +379,20 @@ def affine_pass(base, class_base, n, cu, cv, weight, du, dv, where, tables, clas
 
 
 @jit
-def turn_gain(base, other, n, cu, cv, gu, gv):
+def turn_gain(cu, cv, other_u, other_v, gu, gv):
     """Sum of slope times cells moved between two angles."""
-    total = np.int64(0)
-    for k in range(n):
-        total += np.int64(gu[k] * (cu[other + k] - cu[base + k]) + gv[k] * (cv[other + k] - cv[base + k]))
-    return total
+    total = np.int32(0)
+    for k in range(cu.shape[0]):
+        a = np.int32(gu[k] * np.int32(other_u[k] - cu[k]))
+        b = np.int32(gv[k] * np.int32(other_v[k] - cv[k]))
+        total = np.int32(total + np.int32(a + b))
+    return np.int64(total)
 
 
 @jit
 def search(
     options, pu, pv, weight, start, cosine, sine, size, count, lanes, blocks, place, affine, affine_place,
-    class_of, classes, slots, prior, prior_at, cu, cv, have, lists, list_counts, near, near_have, gu, gv,
+    class_of, classes, slots, prior, prior_at, cu, cv, have, lists, list_counts, near, near_have, at, gu, gv,
     box, root, keys, codes, found_codes, found_scores, state,
 ):  # fmt: skip
     """Best-first branch and bound over (theta, v, u); resumable, see ``grcsm.py`` for the arguments."""
@@ -402,13 +416,17 @@ def search(
         for it in range(nt):
             if first == 0:
                 ensure_cells(it, n, pu, pv, cosine, sine, start, cu, cv, have)
-                score_box(it * n, n, cu, cv, weight, chunk, lanes, 0, nv, 0, nu, box)
+                score_box(it * n, n, cu, cv, weight, chunk, lanes, 0, nv, 0, nu, at, box)
             else:
                 middle = it * size[first, 2] + size[first, 2] // 2
                 ensure_cells(middle, n, pu, pv, cosine, sine, start, cu, cv, have)
                 slot = slots[first] + it
                 if list_counts[slot] < 0:
-                    merge_blocks(it, first, n, size, cu, cv, weight, classes, first, lists, list_counts, slot)
+                    own = slice(middle * n, middle * n + n)
+                    merge_blocks(
+                        cu[own], cv[own], weight, classes[first * n : first * n + n], size[first, 0],
+                        size[first, 1], at, lists, list_counts, slot,
+                    )  # fmt: skip
                 bound_box(slot, n, lists, list_counts, blocks, place[first], 0, nv, 0, nu, box)
             for i in range(nv * nu):
                 value = box[i]
@@ -497,6 +515,7 @@ def search(
         bt, bv, bu = size[level, 2], size[level, 1], size[level, 0]
         lt, lv, lu = size[level - 1, 2], size[level - 1, 1], size[level - 1, 0]
         ft, fv, fu = bt // lt, bv // lv, bu // lu
+        state[EXPANDED + level] += 1
         t0, v0, u0 = t * bt, v * bv, u * bu  # the node's first leaf
         shift = affine_place[level, 4]
         majorant = shift >= 0
@@ -507,17 +526,21 @@ def search(
             flag = slots[level] + t
             class_base = affine_place[level, 5] * n
             if near_have[flag] == 0:
-                affine_classes(t, bt, n, cu, cv, class_of[level], near[class_base:])
+                near_at = class_base + t * n
+                affine_classes(t0, middle, bt, n, cu, cv, class_of[level], at, near[near_at : near_at + n])
                 near_have[flag] = 1
+            here = slice(middle * n, middle * n + n)
+            mu, mv = cu[here], cv[here]
             affine_pass(
-                middle * n, class_base + t * n, n, cu, cv, weight, u0 + bu // 2, v0 + bv // 2,
-                affine_place[level], affine, near, gu, gv, sums,
+                mu, mv, near[(class_base + t * n) : (class_base + t * n + n)], weight, u0 + bu // 2,
+                v0 + bv // 2, affine_place[level], affine, at[:n], gu[:n], gv[:n], sums,
             )  # fmt: skip
             for i in range(bt):
                 if t0 + i == middle:
                     turns[i] = 0
                 else:
-                    turns[i] = turn_gain(middle * n, (t0 + i) * n, n, cu, cv, gu, gv)
+                    there = slice((t0 + i) * n, (t0 + i) * n + n)
+                    turns[i] = turn_gain(mu, mv, cu[there], cv[there], gu[:n], gv[:n])
         best_child, best_key = np.int64(-1), -(np.int64(1) << 60)
         next_t, next_v, next_u = np.int64(0), np.int64(0), np.int64(0)
         for a in range(ft):
@@ -529,9 +552,10 @@ def search(
                     turn = max(turn, turns[a * lt + i])
                 evaluations += fv * fu
                 if level == 1:
-                    # is any leaf of this angle worth its score?
-                    worth = False
+                    # score the rows that hold a leaf whose bound beats the incumbent
+                    ensure_cells(ct, n, pu, pv, cosine, sine, start, cu, cv, have)
                     for b in range(fv):
+                        worth = False
                         for c in range(fu):
                             value = sums[0] + turn + sums[2] * (b - bv // 2) + sums[1] * (c - bu // 2)
                             value = value >> shift
@@ -542,23 +566,30 @@ def search(
                                     + prior[prior_at[0, 0] + u0 + c]
                                 )
                             worth = worth or keeps(min(value, bound), pack(ct, v0 + b, u0 + c), cut, cut_code)
-                    if not worth:
-                        continue
+                        line = box[b * fu : (b + 1) * fu]
+                        if worth:
+                            state[EXPANDED] += 1
+                            evaluations += fu
+                            score_box(ct * n, n, cu, cv, weight, chunk, lanes, v0 + b, 1, u0, fu, at, line)
+                        else:
+                            line[:] = NOTHING
             elif level > 1:
                 middle = ct * lt + lt // 2
                 ensure_cells(middle, n, pu, pv, cosine, sine, start, cu, cv, have)
                 slot = slots[level - 1] + ct
                 if list_counts[slot] < 0:
+                    own = slice(middle * n, middle * n + n)
                     merge_blocks(
-                        ct, level - 1, n, size, cu, cv, weight, classes, level - 1, lists, list_counts, slot
-                    )
+                        cu[own], cv[own], weight, classes[(level - 1) * n : level * n], lu, lv, at, lists,
+                        list_counts, slot,
+                    )  # fmt: skip
                 bound_box(
                     slot, n, lists, list_counts, blocks, place[level - 1], v0 // lv, fv, u0 // lu, fu, box
                 )
                 evaluations += fv * fu
-            if level == 1:
+            if level == 1 and not majorant:
                 ensure_cells(ct, n, pu, pv, cosine, sine, start, cu, cv, have)
-                score_box(ct * n, n, cu, cv, weight, chunk, lanes, v0, fv, u0, fu, box)
+                score_box(ct * n, n, cu, cv, weight, chunk, lanes, v0, fv, u0, fu, at, box)
                 evaluations += fv * fu
             for b in range(fv):
                 for c in range(fu):
@@ -578,7 +609,7 @@ def search(
                     code = pack(ct * lt, v0 + b * lv, u0 + c * lu)
                     if level == 1:
                         if collect:
-                            if value > cut:
+                            if value > cut and value > NOTHING // 2:
                                 found_codes[n_found], found_scores[n_found] = code, value
                                 n_found += 1
                         elif keeps(value, code, cut, cut_code):
@@ -615,15 +646,13 @@ def search(
 def brute(n, pu, pv, weight, chunk, start, cosine, sine, count, lanes, prior, prior_at, has_prior, state):
     """Score every pose of the window; the first of the best in (theta, v, u) order wins."""
     nt, nv, nu = count[0, 2], count[0, 1], count[0, 0]
-    cu, cv = np.empty(n, np.int32), np.empty(n, np.int32)
+    cu, cv, at = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int32)
     box = np.empty(nu, np.int64)
-    one_cos, one_sin = np.empty(1, np.float64), np.empty(1, np.float64)
     best, best_code = np.int64(-(1 << 60)), np.int64(0)
     for t in range(nt):
-        one_cos[0], one_sin[0] = cosine[t], sine[t]
-        fill_cells(0, n, pu, pv, one_cos, one_sin, start, cu, cv)
+        fill_cells(cosine[t], sine[t], pu, pv, start, cu, cv)
         for v in range(nv):
-            score_box(0, n, cu, cv, weight, chunk, lanes, v, 1, 0, nu, box)
+            score_box(0, n, cu, cv, weight, chunk, lanes, v, 1, 0, nu, at, box)
             for u in range(nu):
                 value = box[u]
                 if has_prior:
@@ -706,14 +735,56 @@ def printed(
 
 
 @jit
-def distances(points, edges, out):
-    """Distance of every point (n, 2) to the nearest edge (m, 2, 2)."""
+def prepare(points, motion, box, shift, swing, scale_u, scale_v, given, pu, pv, weight, out):
+    """Carry points by ``motion`` (cos, sin, u, v), choose the pivot, drop what can never meet the model.
+
+    ``box`` (low u, low v, high u, high v) holds the model and its blur; ``shift`` and ``swing`` are the
+    farthest that a window moves a point by translation, and by rotation a unit of radius. ``out``: pivot
+    (2), largest radius, number of points kept. ``given`` may be empty: unit weights.
+    """
+    n = points.shape[0]
+    cosine, sine = motion[0], motion[1]
+    low_u, low_v, high_u, high_v = np.inf, np.inf, -np.inf, -np.inf
+    for attempt in range(2):
+        for k in range(n):
+            u = cosine * points[k, 0] - sine * points[k, 1] + motion[2]
+            v = sine * points[k, 0] + cosine * points[k, 1] + motion[3]
+            pu[k], pv[k] = u, v
+            off_u, off_v = max(box[0] - u, u - box[2], 0.0), max(box[1] - v, v - box[3], 0.0)
+            if attempt == 1 or off_u * off_u + off_v * off_v <= shift * shift:
+                low_u, high_u = min(low_u, u), max(high_u, u)
+                low_v, high_v = min(low_v, v), max(high_v, v)
+        if low_u <= high_u:
+            break
+    pivot_u, pivot_v = 0.5 * (low_u + high_u), 0.5 * (low_v + high_v)
+    m, reach = 0, 0.0
+    for k in range(n):
+        u, v = pu[k], pv[k]
+        off_u, off_v = max(box[0] - u, u - box[2], 0.0), max(box[1] - v, v - box[3], 0.0)
+        radius = np.sqrt((u - pivot_u) ** 2 + (v - pivot_v) ** 2)
+        if np.sqrt(off_u * off_u + off_v * off_v) <= shift + swing * radius + 1e-9:
+            pu[m], pv[m] = (u - pivot_u) * scale_u, (v - pivot_v) * scale_v
+            weight[m] = given[k] if given.shape[0] > 0 else np.uint64(1)
+            reach = max(reach, radius)
+            m += 1
+    out[0], out[1], out[2], out[3] = pivot_u, pivot_v, reach, m
+
+
+@jit
+def fitness(points, motion, edges, gate):
+    """Number of points within ``gate`` of the edges after ``motion``, and their sum of squared distances."""
+    count, total = 0, 0.0
     for k in range(points.shape[0]):
+        x = motion[0] * points[k, 0] - motion[1] * points[k, 1] + motion[2]
+        y = motion[1] * points[k, 0] + motion[0] * points[k, 1] + motion[3]
         least = np.inf
         for e in range(edges.shape[0]):
             du, dv = edges[e, 1, 0] - edges[e, 0, 0], edges[e, 1, 1] - edges[e, 0, 1]
-            pu, pv = points[k, 0] - edges[e, 0, 0], points[k, 1] - edges[e, 0, 1]
+            pu, pv = x - edges[e, 0, 0], y - edges[e, 0, 1]
             size = du * du + dv * dv
             f = min(1.0, max(0.0, (pu * du + pv * dv) / size)) if size > 0.0 else 0.0
             least = min(least, (pu - f * du) ** 2 + (pv - f * dv) ** 2)
-        out[k] = np.sqrt(least)
+        if least <= gate * gate:
+            count += 1
+            total += least
+    return count, total

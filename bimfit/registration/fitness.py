@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from bimfit.geometry.pose import Array, Pose2D
@@ -16,9 +18,11 @@ def fitness_of(target: Target, points: Array, pose: Pose2D) -> tuple[float, floa
 
     The share is 0 and the distance NaN when there is none.
     """
-    out = np.empty(len(points))
-    _kernels.distances(np.ascontiguousarray(pose.inverse().apply(points)), target.edges, out)
-    near = out[out <= INLIER_SIGMAS * target.blur]
-    if len(near) == 0:
+    back = pose.inverse()
+    motion = np.array([math.cos(back.theta), math.sin(back.theta), back.u, back.v])
+    count, total = _kernels.fitness(
+        np.ascontiguousarray(points), motion, target.edges, INLIER_SIGMAS * target.blur
+    )
+    if count == 0:
         return 0.0, float("nan")
-    return len(near) / len(points), float(np.sqrt(np.dot(near, near) / len(near)))
+    return count / len(points), math.sqrt(total / count)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import threading
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,9 +21,11 @@ from bimfit.registration.table import BLUR_REACH, Tables, Target
 
 MIN_POINTS = 3
 WEIGHT_STEPS = 255  # unequal weights are rounded to this many steps of the greatest
-ROOT_COST = 40_000.0  # table rows that the first level may cost
+ROOT_COST = 300_000.0  # look-ups that bounding the whole first level may cost
 TIME_SLICE = 20_000  # evaluations between two looks at the clock
 NOTHING = kernels.NOTHING
+_UNIT: NDArray[np.uint64] = np.zeros(0, np.uint64)  # stands for unit weights
+lattice_of = functools.lru_cache(maxsize=64)(Lattice.of)
 
 
 @dataclass(frozen=True)
@@ -65,54 +67,57 @@ class Problem:
 
 
 def pose_problem(
-    target: Target, points: Array, weights: ArrayLike | None, config: SearchConfig, bound: Bound
+    target: Target,
+    points: Array,
+    prior: Pose2D,
+    weights: ArrayLike | None,
+    config: SearchConfig,
+    bound: Bound,
 ) -> Problem | None:
-    """Bring a slice, already carried by the prior's inverse, into the kernels' terms.
+    """Bring a slice into the kernels' terms.
 
-    Points that no pose of the window brings near the model score 0 everywhere and are left out. None
-    when fewer than three are left.
+    Points that no pose of the window brings near the model score 0 everywhere and are left out, as are
+    those that are not numbers. None when fewer than three are left.
 
     Raises
     ------
     ConfigError
         When the weights do not suit the points.
     """
-    lattice = Lattice.of(config)
-    w, unit, rounding = _weights(weights, len(points))
+    lattice = lattice_of(config)
+    n = len(points)
+    given, unit, rounding = _weights(weights, n)
     margin = BLUR_REACH * target.blur + lattice.step[0] + lattice.step[1]
-    low, high = target.edges.min(axis=(0, 1)) - margin, target.edges.max(axis=(0, 1)) + margin
-    off = np.maximum(np.maximum(low - points, points - high), 0.0)
-    far = np.sqrt(off[:, 0] ** 2 + off[:, 1] ** 2)
-    shift = math.hypot(lattice.half[0], lattice.half[1])
-    near = points[far <= shift]
-    if len(near) == 0:
-        near = points
-    pivot = 0.5 * (near.min(axis=0) + near.max(axis=0))
-    arm = points - pivot
-    radius = np.sqrt(arm[:, 0] ** 2 + arm[:, 1] ** 2)
-    keep = far <= shift + 2.0 * math.sin(0.5 * min(lattice.half[2], math.pi)) * radius
-    if not keep.all():
-        arm, radius, w = arm[keep], radius[keep], w[keep]
-    if len(arm) < MIN_POINTS:
-        return None
-    tables = target.tables(lattice, bound, float(radius.max()))
+    low_u, low_v, high_u, high_v = target.box
+    box = np.array([low_u - margin, low_v - margin, high_u + margin, high_v + margin])
+    back = prior.inverse()
+    motion = np.array([math.cos(back.theta), math.sin(back.theta), back.u, back.v])
     step_u, step_v = lattice.step[0], lattice.step[1]
+    pu, pv, weight, out = np.empty(n), np.empty(n), np.empty(n, np.uint64), np.empty(4)
+    kernels.prepare(
+        points, motion, box, math.hypot(lattice.half[0], lattice.half[1]),
+        2.0 * math.sin(0.5 * min(lattice.half[2], math.pi)), 1.0 / step_u, 1.0 / step_v, given, pu, pv,
+        weight, out,
+    )  # fmt: skip
+    kept = int(out[3])
+    if kept < MIN_POINTS:
+        return None
+    tables = target.tables(lattice, bound, float(out[2]))
     start = np.array(
         [
-            (pivot[0] + lattice.first[0] - tables.origin[0]) / step_u,
-            (pivot[1] + lattice.first[1] - tables.origin[1]) / step_v,
+            (out[0] + lattice.first[0] - tables.origin[0]) / step_u,
+            (out[1] + lattice.first[1] - tables.origin[1]) / step_v,
             step_v / step_u,
             step_u / step_v,
             config.eps,
         ]
     )
-    pu, pv = np.ascontiguousarray(arm[:, 0] / step_u), np.ascontiguousarray(arm[:, 1] / step_v)
-    return Problem(tables, pivot, pu, pv, np.ascontiguousarray(w), unit, start, rounding)
+    return Problem(tables, out[:2], pu[:kept], pv[:kept], weight[:kept], unit, start, rounding)
 
 
 def _weights(weights: ArrayLike | None, n: int) -> tuple[NDArray[np.uint64], float, float]:
     if weights is None:
-        return np.ones(n, np.uint64), 1.0 / kernels.FULL, 0.5 * n / kernels.FULL
+        return _UNIT, 1.0 / kernels.FULL, 0.5 * n / kernels.FULL
     values = np.asarray(weights, float)
     if values.shape != (n,) or not np.all(np.isfinite(values)) or np.any(values < 0.0):
         raise ConfigError(f"weights are {n} numbers of at least 0, one a point")
@@ -143,37 +148,85 @@ def prior_table(config: SearchConfig, lattice: Lattice, unit: float) -> tuple[In
     return np.concatenate(parts), place, True
 
 
+@dataclass(frozen=True)
+class Plan:
+    """What a search of up to ``capacity`` points on one set of tables needs to know, worked out once."""
+
+    first: int
+    roots: int
+    fan: int
+    slots: Integers
+    half_angle: Array
+    slot_count: int
+    near: int
+    capacity: int
+
+    @classmethod
+    def of(cls, tables: Tables, capacity: int) -> Plan:
+        """Choose the first level and count what the workspace must hold."""
+        lattice = tables.lattice
+        top, nodes, size = lattice.top, lattice.nodes, lattice.size
+        affine = np.flatnonzero(tables.affine_place[:, 4] >= 0)
+        first = first_level(lattice, capacity, int(affine.max(initial=1)))
+        fan = max((int((size[h] // size[h - 1]).prod()) for h in range(1, top + 1)), default=1)
+        ends = np.cumsum(nodes[:, 2])
+        slots = np.concatenate([[0], ends[:-1]]).astype(np.int64)
+        return cls(
+            first, int(nodes[first].prod()), fan, slots, lattice.half_angle, int(ends[-1]),
+            int(nodes[affine, 2].sum()), capacity,
+        )  # fmt: skip
+
+
 class Workspace:
-    """Scratch arrays of one thread, grown as needed and used again."""
+    """Scratch arrays of one thread for one plan; the queue and the collected leaves grow as needed."""
 
-    def __init__(self) -> None:
-        self._arrays: dict[str, NDArray[Any]] = {}
+    def __init__(self, plan: Plan, lattice: Lattice) -> None:
+        n, angles, wide = plan.capacity, lattice.count[2], int(lattice.nodes[plan.first, :2].prod())
+        self.classes = np.empty((lattice.top + 1) * n, np.uint8)
+        self.cu, self.cv = np.empty(angles * n, np.int32), np.empty(angles * n, np.int32)
+        self.flags = np.zeros(angles + plan.slot_count, np.uint8)
+        self.have, self.near_have = self.flags[:angles], self.flags[angles:]
+        self.list_counts = np.empty(plan.slot_count, np.int32)
+        self.lists = np.empty((4, plan.slot_count * n), np.int32)
+        self.near = np.empty(max(1, plan.near) * n, np.uint8)
+        self.at, self.gu, self.gv = (np.empty(2 * n, np.int32) for _ in range(3))
+        self.box = np.empty(max(wide, plan.fan) + 4, np.int64)
+        self.root = np.empty(plan.roots, np.int64)
+        self.keys = np.empty(plan.roots + (lattice.top + 2) * plan.fan + 1024, np.int64)
+        self.codes = np.empty_like(self.keys)
+        self.found = np.empty(max(1024, 2 * plan.fan), np.int64)
+        self.values = np.empty_like(self.found)
 
-    def get(self, name: str, size: int, kind: type[np.generic]) -> NDArray[Any]:
-        """An array of at least ``size``, its content unspecified."""
-        array = self._arrays.get(name)
-        if array is None or len(array) < size:
-            array = np.empty(max(size, 16), kind)
-            self._arrays[name] = array
-        return array
+    def clear(self) -> None:
+        """Forget the last slice."""
+        self.flags[:] = 0
+        self.list_counts[:] = -1
 
-    def grow(self, name: str, kept: int) -> NDArray[Any]:
-        """Double an array, keeping its first ``kept`` values."""
-        old = self._arrays[name]
-        array = np.empty(2 * len(old), old.dtype)
-        array[:kept] = old[:kept]
-        self._arrays[name] = array
-        return array
+    def grow(self, *names: str) -> None:
+        """Double arrays, keeping their values."""
+        for name in names:
+            old = getattr(self, name)
+            array = np.empty(2 * len(old), old.dtype)
+            array[: len(old)] = old
+            setattr(self, name, array)
 
 
 _LOCAL = threading.local()
+KEPT_WORKSPACES = 4
 
 
-def _workspace() -> Workspace:
-    if not hasattr(_LOCAL, "workspace"):
-        _LOCAL.workspace = Workspace()
-    work: Workspace = _LOCAL.workspace
-    return work
+def _workspace(tables: Tables, n: int) -> tuple[Plan, Workspace]:
+    """The calling thread's plan and scratch arrays for some tables, made anew only for more points."""
+    kept: dict[int, tuple[Tables, Plan, Workspace]] = _LOCAL.__dict__.setdefault("kept", {})
+    held = kept.get(id(tables))
+    if held is None or held[1].capacity < n:
+        while len(kept) >= KEPT_WORKSPACES:
+            del kept[next(iter(kept))]
+        plan = Plan.of(tables, -(-n // 64) * 64)
+        held = tables, plan, Workspace(plan, tables.lattice)
+        kept[id(tables)] = held
+    held[2].clear()
+    return held[1], held[2]
 
 
 def first_level(lattice: Lattice, n: int, lowest: int) -> int:
@@ -205,45 +258,12 @@ def run(
 ) -> Outcome:  # fmt: skip
     """Search, resuming after every look at the clock or growth of the queue."""
     tables, lattice, n = problem.tables, problem.tables.lattice, problem.n
-    work = _workspace()
-    top, nodes, size = lattice.top, lattice.nodes, lattice.size
-    affine_levels = np.flatnonzero(tables.affine_place[:, 4] >= 0)
-    first = first_level(lattice, n, int(affine_levels.max(initial=1)))
-    roots = int(nodes[first].prod())
-    fan = max(int((size[h] // size[h - 1]).prod()) for h in range(1, top + 1)) if top else 1
+    plan, work = _workspace(tables, n)
     prior, prior_at, has_prior = prior_table(config, lattice, problem.unit)
-    slots = np.concatenate([[0], np.cumsum(nodes[:, 2])])[:-1].astype(np.int64)
-    n_slots = int(nodes[:, 2].sum())
-    classes = work.get("classes", (top + 1) * n, np.uint8)
     kernels.point_classes(
-        n,
-        problem.pu,
-        problem.pv,
-        lattice.step[0],
-        lattice.step[1],
-        lattice.half_angle,
-        tables.class_of,
-        classes,
-    )
-    angles = lattice.count[2]
-    cu, cv = work.get("cu", angles * n, np.int32), work.get("cv", angles * n, np.int32)
-    have, near_have = work.get("have", angles, np.uint8), work.get("near_have", n_slots, np.uint8)
-    have[:angles] = 0
-    near_have[:n_slots] = 0
-    list_counts = work.get("list_counts", n_slots, np.int32)
-    list_counts[:n_slots] = -1
-    lists = work.get("lists", 4 * n_slots * n, np.int32)
-    lists = lists[: 4 * n_slots * n].reshape(4, n_slots * n)
-    near = work.get("near", int(nodes[affine_levels, 2].sum()) * n + 1, np.uint8)
-    gu, gv = work.get("gu", n, np.int32), work.get("gv", n, np.int32)
-    box = work.get("box", max(int(nodes[first, 0] * nodes[first, 1]), fan) + 4, np.int64)
-    root = work.get("root", roots, np.int64)
-    keys = work.get("keys", roots + (top + 2) * fan + 1024, np.int64)
-    codes = work.get("codes", len(keys), np.int64)
-    found = work.get("found", max(1024, 2 * fan), np.int64)
-    values = work.get("values", len(found), np.int64)
-    if len(codes) < len(keys):
-        codes = work.get("codes", len(keys), np.int64)
+        n, problem.pu, problem.pv, lattice.step[0], lattice.step[1], plan.half_angle, tables.class_of,
+        work.classes,
+    )  # fmt: skip
     state = np.zeros(kernels.STATE_SIZE, np.int64)
     state[kernels.BEST], state[kernels.BEST_CODE] = NOTHING, 0
     if incumbent is not None:
@@ -252,22 +272,21 @@ def run(
         )
     limit = config.max_evaluations if config.max_evaluations is not None else 1 << 60
     options = np.array(
-        [n, first, top, problem.chunk, limit, TIME_SLICE if deadline is not None else 1 << 60,
+        [n, plan.first, lattice.top, problem.chunk, limit, TIME_SLICE if deadline is not None else 1 << 60,
          collect_from is not None, collect_from or 0, has_prior], np.int64,
     )  # fmt: skip
     while True:
         ended = kernels.search(
-            options, problem.pu, problem.pv, problem.weight, problem.start, tables.cosine, tables.sine, size,
-            nodes, tables.lanes, tables.blocks, tables.block_place, tables.affine, tables.affine_place,
-            tables.class_of, classes, slots, prior, prior_at, cu, cv, have, lists, list_counts, near,
-            near_have, gu, gv, box, root, keys, codes, found, values, state,
+            options, problem.pu, problem.pv, problem.weight, problem.start, tables.cosine, tables.sine,
+            lattice.size, lattice.nodes, tables.lanes, tables.blocks, tables.block_place, tables.affine,
+            tables.affine_place, tables.class_of, work.classes, plan.slots, prior, prior_at, work.cu, work.cv,
+            work.have, work.lists, work.list_counts, work.near, work.near_have, work.at, work.gu, work.gv,
+            work.box, work.root, work.keys, work.codes, work.found, work.values, state,
         )  # fmt: skip
         if ended == kernels.HEAP_FULL:
-            kept = int(state[kernels.HEAP])
-            keys, codes = work.grow("keys", kept), work.grow("codes", kept)
+            work.grow("keys", "codes")
         elif ended == kernels.FOUND_FULL:
-            kept = int(state[kernels.FOUND])
-            found, values = work.grow("found", kept), work.grow("values", kept)
+            work.grow("found", "values")
         elif (
             ended != kernels.BUDGET
             or state[kernels.EVALUATIONS] >= limit
@@ -275,10 +294,11 @@ def run(
         ):
             break
     count = int(state[kernels.FOUND])
-    stop: Stop = {kernels.DONE: "proven", kernels.TOLERANCE: "tolerance"}.get(ended, "budget")
+    names: dict[int, Stop] = {kernels.DONE: "proven", kernels.TOLERANCE: "tolerance"}
+    stop = names.get(ended, "budget")
     return Outcome(
         int(state[kernels.BEST]), int(state[kernels.BOUND]), unpack(int(state[kernels.BEST_CODE])),
-        int(state[kernels.EVALUATIONS]), stop, (found[:count].copy(), values[:count].copy()),
+        int(state[kernels.EVALUATIONS]), stop, (work.found[:count].copy(), work.values[:count].copy()),
     )  # fmt: skip
 
 
@@ -293,13 +313,13 @@ def _leaf_score(
 ) -> tuple[int, int]:
     """Score and code of one leaf."""
     n, tables = problem.n, problem.tables
-    cu, cv, out = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(1, np.int64)
-    angle = slice(index[2], index[2] + 1)
+    cu, cv, at = (np.empty(n, np.int32) for _ in range(3))
+    out = np.empty(1, np.int64)
     kernels.fill_cells(
-        0, n, problem.pu, problem.pv, tables.cosine[angle], tables.sine[angle], problem.start, cu, cv
+        tables.cosine[index[2]], tables.sine[index[2]], problem.pu, problem.pv, problem.start, cu, cv
     )
     kernels.score_box(
-        0, n, cu, cv, problem.weight, problem.chunk, tables.lanes, index[1], 1, index[0], 1, out
+        0, n, cu, cv, problem.weight, problem.chunk, tables.lanes, index[1], 1, index[0], 1, at, out
     )
     value = int(out[0])
     if has_prior:

@@ -97,9 +97,9 @@ def sample(edges: Array, spacing: float = SPACING) -> tuple[Array, Array]:
     return np.concatenate(points), np.concatenate(normals)
 
 
-def _extruded(points: Array, width: Array) -> Array:
-    flat = np.repeat(points, len(width), axis=0)
-    return np.column_stack([flat, np.tile(width, len(points))])
+def _extruded(points: Array, width: ArrayLike) -> Array:
+    along = np.asarray(width, np.float64)
+    return np.column_stack([np.repeat(points, len(along), axis=0), np.tile(along, len(points))])
 
 
 def _flat(points: Array) -> Array:
@@ -127,13 +127,7 @@ def _open3d(name: str, kind: Kind, target: Target, slice_: Slice, starts: tuple[
 
     registration = o3d.pipelines.registration
     model = _cloud(o3d, target)
-    estimation: Any = {
-        "point": registration.TransformationEstimationPointToPoint,
-        "plane": registration.TransformationEstimationPointToPlane,
-        "robust": lambda: registration.TransformationEstimationPointToPlane(
-            registration.TukeyLoss(k=GATE_SIGMAS * target.blur)
-        ),
-    }[kind]()
+    estimation = _estimation(registration, kind, GATE_SIGMAS * target.blur)
     criteria = registration.ICPConvergenceCriteria(max_iteration=ITERATIONS)
     started = time.perf_counter()
     best: MatchResult | None = None
@@ -153,6 +147,14 @@ def _open3d(name: str, kind: Kind, target: Target, slice_: Slice, starts: tuple[
             best = result
     assert best is not None
     return best
+
+
+def _estimation(registration: Any, kind: Kind, scale: float) -> Any:
+    if kind == "point":
+        return registration.TransformationEstimationPointToPoint()
+    if kind == "plane":
+        return registration.TransformationEstimationPointToPlane()
+    return registration.TransformationEstimationPointToPlane(registration.TukeyLoss(k=scale))
 
 
 def _cloud(o3d: Any, target: Target) -> Any:

@@ -75,17 +75,17 @@ class Lattice:
             steps.append(width / s**level if level else tolerance)  # Eq. 3 and 4
         return cls(_three(config.window), _three(steps), _three(tests), _three(levels))
 
-    @property
+    @cached_property
     def count(self) -> tuple[int, int, int]:
         """Poses an axis, c (Eq. 3)."""
         return _three([s**level for s, level in zip(self.tests, self.levels, strict=True)])
 
-    @property
+    @cached_property
     def first(self) -> tuple[float, float, float]:
         """The motion of index 0 on each axis."""
         return _three([-0.5 * q * (c - 1) for q, c in zip(self.step, self.count, strict=True)])
 
-    @property
+    @cached_property
     def top(self) -> int:
         """Levels above the leaves."""
         return max(self.levels)
@@ -111,10 +111,10 @@ class Lattice:
         """Every angle of the lattice, rad."""
         return self.first[2] + self.step[2] * np.arange(self.count[2])
 
-    @property
+    @cached_property
     def half_angle(self) -> Array:
         """Half a node's angle on each level, seen from its middle leaf, rad; shape (top + 1,)."""
-        return np.asarray((self.size[:, 2] // 2) * self.step[2], float)
+        return np.array((self.size[:, 2] // 2) * self.step[2], dtype=np.float64)
 
     def motion(self, index: tuple[int, int, int]) -> tuple[float, float, float]:
         """The motion (u, v, theta) of a leaf."""

@@ -20,7 +20,7 @@ from bimfit.registration.grcsm import Outcome, Problem
 from bimfit.registration.icp import g_icp, icp_multistart, icp_plane, icp_plane_robust, icp_point
 from bimfit.registration.modes import near_optimal
 from bimfit.registration.printed import run_brute, run_printed
-from bimfit.registration.result import MatchResult
+from bimfit.registration.result import MatchResult, Mode
 from bimfit.registration.table import Target
 
 Matcher = Callable[..., MatchResult]
@@ -121,12 +121,12 @@ def _guarded(
     name: str, bound: Bound, target: Target, slice_: Slice, prior: Pose2D, config: SearchConfig,
     weights: ArrayLike | None, runner: Callable[[Problem, SearchConfig], Outcome],
 ) -> MatchResult:  # fmt: skip
-    points = np.asarray(slice_.points, np.float64).reshape(-1, 2)
+    points = np.ascontiguousarray(slice_.points, np.float64).reshape(-1, 2)
     if target.empty:
         return MatchResult(name, LOST, status=Status("no_data", "no surface of the model is visible"))
     if len(points) < grcsm.MIN_POINTS:
         return MatchResult(name, LOST, status=Status("no_data", f"only {len(points)} points in the slice"))
-    problem = grcsm.pose_problem(target, prior.inverse().apply(points), weights, config, bound)
+    problem = grcsm.pose_problem(target, points, prior, weights, config, bound)
     if problem is None:
         return MatchResult(
             name, LOST, status=Status("no_data", "no pose of the window brings the points to the model")
@@ -150,7 +150,8 @@ def _result(
         )  # fmt: skip
     pose = grcsm.pose_of(problem, outcome.index, prior)
     share, rmse = fitness_of(target, points, pose)
-    status, modes = OK, ()
+    status = OK
+    modes: tuple[Mode, ...] = ()
     if share == 0.0:
         status = Status("rejected", "no point of the slice lies near the model in any pose of the window")
     elif config.delta > 0.0 and outcome.stop == "proven":
@@ -160,7 +161,8 @@ def _result(
             status = Status("ambiguous", f"{len(modes)} rival pose(s), the best with score {best.score:.4g}")
     return MatchResult(
         name, pose.as_array(), outcome.score * problem.unit, outcome.bound * problem.unit,
-        outcome.evaluations, outcome.stop, status, lattice.levels, share, rmse, modes, seconds, problem.rounding,
+        outcome.evaluations, outcome.stop, status, lattice.levels, share, rmse, modes, seconds,
+        problem.rounding,
     )  # fmt: skip
 
 

@@ -24,7 +24,8 @@ def run_printed(problem: Problem, config: SearchConfig) -> Outcome:
     while True:
         ended = kernels.printed(
             problem.n, problem.pu, problem.pv, problem.weight, problem.start, lattice.first[2],
-            lattice.step[2], size, lattice.nodes, tables.blocks, tables.block_place, keys, codes, limit, state,
+            lattice.step[2], size, lattice.nodes, tables.blocks, tables.block_place, keys, codes, limit,
+            state,
         )  # fmt: skip
         if ended != kernels.HEAP_FULL:
             break

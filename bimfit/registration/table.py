@@ -6,6 +6,7 @@ import math
 import threading
 import time
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -161,7 +162,7 @@ def _majorant_levels(lattice: Lattice, sigma: float) -> tuple[int, ...]:
     out = []
     for level in range(1, lattice.top + 1):
         widest = int(lattice.size[level, :2].max())
-        if level == 1 or widest <= 2.0 * sigma:
+        if (level == 1 and widest <= 8.0 * sigma) or widest <= 3.2 * sigma:
             out.append(level)
     return tuple(out)
 
@@ -286,6 +287,12 @@ class Target:
         if not np.all(np.isfinite(pieces)):
             raise ConfigError("the model's edges hold a coordinate that is not a number")
         return cls(pieces, float(blur))
+
+    @cached_property
+    def box(self) -> tuple[float, float, float, float]:
+        """Least u and v, greatest u and v of the edges, m."""
+        low, high = self.edges.min(axis=(0, 1)), self.edges.max(axis=(0, 1))
+        return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
     @property
     def empty(self) -> bool:
