@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import json
 import math
@@ -15,7 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bimfit.errors import ExportError
+from bimfit.gap import sheets
 from bimfit.gap.export import FORMATS, export_mesh
+from bimfit.gap.ladder import ladder
 from bimfit.gap.mesh import loft
 from bimfit.gap.runs import find_runs
 from bimfit.gap.volume import gap_volumes
@@ -66,6 +69,25 @@ def test_a_uniform_joint_is_a_prism(name):
     for s in (sections[0], sections[-1]):
         corners = s.frame.to_world(np.concatenate([s.side_a, s.side_b]))
         assert np.abs(corners[:, None] - mesh.vertices[None]).max(axis=2).min(axis=1).max() < 1e-8
+
+
+@pytest.mark.parametrize("ring", [False, True])
+def test_open_rows_close_the_same_way_at_once_and_step_by_step(ring):
+    rng = np.random.default_rng(4)
+    sections = row(rng.normal(size=(7, 6)) * np.tile([5e-4, 5e-4, 5e-3], 2), shapes.STEPPED)
+    rows = ladder(sections)
+    if ring:
+        rows = [dataclasses.replace(r, plane=None) for r in rows]
+    fast, slow = sheets.close_rows(rows, ring=ring), sheets._Sheets(rows, ring=ring).build()
+
+    def triangles(mesh):
+        corners = mesh[0][mesh[1]]
+        first = np.argmin(corners @ [1.0, 3.0, 7.0], axis=1)
+        turned = corners[np.arange(len(corners))[:, None], (first[:, None] + np.arange(3)) % 3]
+        return np.unique(np.round(turned.reshape(-1, 9), 12), axis=0)
+
+    assert np.array_equal(triangles(fast), triangles(slow))
+    assert sorted(fast[2]) == pytest.approx(sorted(slow[2]))
 
 
 def test_a_widening_gap_is_a_prismatoid():
