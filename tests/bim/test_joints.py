@@ -23,13 +23,6 @@ ALL = JointConfig(everything=True)
 needs_data = pytest.mark.skipif(not REAL.is_dir(), reason="../shared/data/ifc is not here")
 
 
-@pytest.fixture(scope="session", autouse=True)
-def own_cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("BIMFIT_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
 def only(found):
     assert len(found) == 1, [(j.kind, j.width, j.length) for j in found]
     return found[0]
