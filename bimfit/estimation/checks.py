@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +71,7 @@ def judge_station(
     slid: SlideResult,
     posteriors: tuple[Posterior | None, Posterior | None],
     residuals: tuple[Residuals, Residuals],
+    steps: tuple[float, float],
     window: Window,
     sensor: SensorConfig,
     fit: FitConfig,
@@ -79,7 +81,8 @@ def judge_station(
 ) -> StationEstimate:
     """Put a station together and say what may be believed of it."""
     components = tuple(
-        _component(p, r, slid.pose, window, sensor, fit) for p, r in zip(posteriors, residuals, strict=True)
+        replace(_component(p, r, slid.pose, window, sensor, fit), corner_step=step)
+        for p, r, step in zip(posteriors, residuals, steps, strict=True)
     )
     status = OK
     for name, c in zip("AB", components, strict=True):

@@ -95,6 +95,8 @@ class ComponentEstimate:
         What the prior was centred on (the combined pose).
     prior_sd : tuple of 3 float
         Its standard deviations about the pivot in u, v (m) and theta (rad).
+    corner_step : float
+        Bearing of the mouth corner in beam steps; NaN where unknown.
     """
 
     pose: Pose2D | None = None
@@ -108,6 +110,7 @@ class ComponentEstimate:
     residuals: Residuals = field(default_factory=Residuals)
     prior: Pose2D | None = None
     prior_sd: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    corner_step: float = float("nan")
 
 
 @dataclass(frozen=True)

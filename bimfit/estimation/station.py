@@ -195,10 +195,20 @@ def _components(
         _residuals(context, which, scene, side, usable) if posteriors[which] is not None else Residuals()
         for which in (0, 1)
     ]
+    steps = [_corner_step(context, which, poses[which]) for which in (0, 1)]
     return checks.judge_station(
-        slice_.s, context.section, slid, (posteriors[0], posteriors[1]), (residuals[0], residuals[1]), window,
-        context.sensor, context.fit, passed, reason, context.virtual,
+        slice_.s, context.section, slid, (posteriors[0], posteriors[1]), (residuals[0], residuals[1]),
+        (steps[0], steps[1]), window, context.sensor, context.fit, passed, reason, context.virtual,
     )  # fmt: skip
+
+
+def _corner_step(context: _Context, which: int, pose: Pose2D) -> float:
+    """Bearing of a mouth corner from the first sensor position, in beam steps."""
+    if context.beams.spacing <= 0.0:
+        return math.nan
+    x, y = pose.apply(context.section.gap.mouth[which]) - context.beams.eye[0, :2]
+    lx, ly = context.beams.eye[0, 2:]
+    return math.atan2(lx * y - ly * x, lx * x + ly * y) / context.beams.spacing
 
 
 def _one(

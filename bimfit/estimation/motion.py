@@ -1,0 +1,307 @@
+"""The joint as a whole: components are bodies, not unrelated slices (METHOD, section 5)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, get_args
+
+import numpy as np
+
+from bimfit.errors import ConfigError
+from bimfit.estimation import trend
+from bimfit.estimation.result import ComponentEstimate, StationEstimate
+from bimfit.estimation.trend import Basis, Sites, Trend
+from bimfit.geometry.joint_section import JointSection
+from bimfit.geometry.pose import Array, Pose2D
+from bimfit.geometry.status import Status
+
+Motion = Literal["independent", "const", "rigid", "linear", "smooth", "kinked", "auto"]
+_FLAG = 16.3
+_KEEP_KNOT = 30.0
+_KINKED_MARGIN = 20.0
+_FEW = 3
+
+
+@dataclass(frozen=True)
+class JointEstimate:
+    """All stations of a joint, estimated together.
+
+    Attributes
+    ----------
+    stations : tuple of StationEstimate
+        With the poses and covariances that the model gives.
+    model : str
+        The motion model used; what ``auto`` chose.
+    criterion : dict of str to float
+        BIC of every model tried, lower is better.
+    knots : ndarray, shape (k,)
+        Stations' distances along the joint at which the ``kinked`` model bends, m.
+    outliers : tuple of (int, str)
+        Stations that disagree with their neighbours, and which component does.
+    """
+
+    stations: tuple[StationEstimate, ...]
+    model: str
+    criterion: dict[str, float] = field(default_factory=dict)
+    knots: Array = field(default_factory=lambda: np.zeros(0))
+    outliers: tuple[tuple[int, str], ...] = ()
+
+
+def estimate_joint(
+    estimates: Sequence[StationEstimate], sections: Sequence[JointSection], model: str = "auto"
+) -> JointEstimate:
+    """Fit a model of motion along the joint to the stations' estimates.
+
+    Parameters
+    ----------
+    estimates, sections : sequence
+        One a station, in the order of the joint.
+    model : {"independent", "const", "rigid", "linear", "smooth", "kinked", "auto"}
+        ``rigid``: u and v linear, theta constant. ``auto`` chooses by BIC.
+
+    Returns
+    -------
+    JointEstimate
+        Stations without an estimate stay without one. A station that disagrees with its neighbours counts
+        less, and is flagged.
+
+    Raises
+    ------
+    ConfigError
+        For a model of another name.
+    """
+    if model not in get_args(Motion):
+        raise ConfigError(f"unknown motion model {model}", remedy="one of " + ", ".join(get_args(Motion)))
+    stations = tuple(estimates)
+    parts = (_sites(stations, sections, 0), _sites(stations, sections, 1))
+    if model == "independent" or min(int(p.known.sum()) for p in parts) < _FEW:
+        return JointEstimate(stations, "independent")
+    fits: dict[str, tuple[Trend, Trend]] = {}
+    criterion: dict[str, float] = {}
+    knots = np.zeros(0)
+    for name in ("const", "rigid", "linear", "smooth", "kinked") if model == "auto" else (model,):
+        if name == "kinked":
+            screen = fits.get("smooth") or _fit_pair(parts, _bases("smooth", parts, knots))
+            knots = _find_knots(parts, [t.weight for t in screen])
+        bases = _bases(name, parts, knots)
+        pair = _fit_pair(parts, bases)
+        fits[name] = pair
+        # the smooth model's two hyper-parameters a component are fitted too
+        freedom = sum(t.freedom for t in pair) + (4.0 if name == "smooth" else 0.0)
+        if name == "kinked":
+            freedom = 6.0 * len(knots) + 2.0 * (len(knots) - 2)
+        count = sum(int(p.known.sum()) for p in parts)
+        criterion[name] = sum(t.deviance for t in pair) + freedom * math.log(count)
+    chosen = _choose(criterion)
+    out, outliers = _apply(stations, sections, parts, fits[chosen])
+    return JointEstimate(out, chosen, criterion, knots if chosen == "kinked" else np.zeros(0), outliers)
+
+
+def _fit_pair(parts: tuple[Sites, Sites], bases: tuple[Basis, Basis]) -> tuple[Trend, Trend]:
+    return trend.fit(parts[0], bases[0]), trend.fit(parts[1], bases[1])
+
+
+def _choose(criterion: dict[str, float]) -> str:
+    best = min(criterion, key=lambda name: criterion[name])
+    if best == "kinked" and criterion.get("smooth", math.inf) < criterion["kinked"] + _KINKED_MARGIN:
+        return min((n for n in criterion if n != "kinked"), key=lambda name: criterion[name])
+    return best
+
+
+def _bases(name: str, parts: tuple[Sites, Sites], knots: Array) -> tuple[Basis, Basis]:
+    s = parts[0].s
+    if name == "smooth":
+        a, b = (trend.smooth(s, _roughness(p)) for p in parts)
+        return a, b
+    if name == "kinked":
+        functions = trend.hats(s, knots)
+        basis = Basis(functions, np.ones((len(knots), 3), bool))
+    else:
+        basis = trend.polynomial(s, turning=name == "linear", moving=name != "const")
+    return basis, basis
+
+
+def _roughness(sites: Sites) -> tuple[float, float]:
+    """The smooth model's two hyper-parameters, by marginal likelihood."""
+    from scipy.optimize import minimize
+
+    span = max(float(np.ptp(sites.s)), 1e-3)
+    unit = np.array([1e-2, 1e-1]) / span**1.5
+    value = trend.Evidence(sites)
+
+    def cost(log: Array) -> float:
+        clipped = np.clip(log, -9.0, 7.0)
+        q = unit * np.exp(clipped)
+        return -value((float(q[0]), float(q[1]))) + float(np.square(log - clipped).sum())
+
+    starts = [np.array([a, b]) for a in (-5.0, 0.0, 4.0) for b in (-5.0, 0.0, 4.0)]
+    begin = min(starts, key=cost)
+    best = minimize(cost, begin, method="Nelder-Mead", options={"xatol": 0.05, "fatol": 0.05, "maxfev": 80})
+    q = unit * np.exp(np.clip(best.x, -9.0, 7.0))
+    return float(q[0]), float(q[1])
+
+
+def _sites(estimates: tuple[StationEstimate, ...], sections: Sequence[JointSection], which: int) -> Sites:
+    """Stations' estimates of one component's reference corner, freed of their priors."""
+    n = len(estimates)
+    value, precision, step = np.zeros((n, 3)), np.zeros((n, 3, 3)), np.full(n, np.nan)
+    for i, (estimate, section) in enumerate(zip(estimates, sections, strict=True)):
+        c = estimate.components[which]
+        if c.pose is None or c.covariance is None or not c.status.measured or not estimate.status.measured:
+            continue
+        corner = section.gap.mouth[which]
+        J = _at_corner(c.pose, corner)
+        x = _motion_of(c.pose, corner)
+        total = np.linalg.inv(J @ c.covariance @ J.T)
+        alone, at = total, total @ x
+        if c.prior is not None and c.posterior is not None:
+            arm = c.pose.apply(corner) - c.posterior.pivot
+            K = np.array([[1.0, 0.0, -arm[1]], [0.0, 1.0, arm[0]], [0.0, 0.0, 1.0]])
+            before = np.linalg.inv((K * np.square(c.prior_sd)) @ K.T)
+            alone, at = total - before, at - before @ _motion_of(c.prior, corner)
+        values, axes = np.linalg.eigh(alone)
+        floor = 1e-6 * values[-1]
+        precision[i] = (axes * np.maximum(values, floor)) @ axes.T
+        value[i] = np.linalg.solve(precision[i], at) if values[0] > floor else x
+        step[i] = c.corner_step
+    s = np.array([e.s for e in estimates])
+    return Sites(s, value, precision, step)
+
+
+def _motion_of(pose: Pose2D, corner: Array) -> Array:
+    return np.array([*(pose.apply(corner) - corner), pose.theta])
+
+
+def _at_corner(pose: Pose2D, corner: Array) -> Array:
+    """Jacobian of the corner's motion by (u, v, theta) of the pose."""
+    arm = pose.turn(corner)
+    return np.array([[1.0, 0.0, -arm[1]], [0.0, 1.0, arm[0]], [0.0, 0.0, 1.0]])
+
+
+def _find_knots(parts: tuple[Sites, Sites], weights: Sequence[Array]) -> Array:
+    """Knots shared by both components: added while they pay, moved, and dropped where they do not."""
+    s = parts[0].s
+    known = np.flatnonzero(parts[0].known | parts[1].known)
+    inner = [int(i) for i in known[1:-1]]
+    knots = [int(known[0]), int(known[-1])]
+    cost = _cost(parts, s, knots, weights)
+    while inner:
+        gains = _gains(parts, s, knots, inner, weights)
+        pick = int(np.argmax(gains))
+        trial = sorted([*knots, inner[pick]])
+        trial, after = _shift(parts, s, trial, weights, around=inner[pick])
+        if cost - after < _KEEP_KNOT:
+            break
+        knots, cost = trial, after
+        inner = [i for i in inner if min(abs(i - k) for k in knots) > 1]
+    for _ in range(2):
+        knots, cost = _shift(parts, s, knots, weights)
+        knots, cost = _drop(parts, s, knots, weights, cost)
+    return s[knots]
+
+
+def _cost(parts: tuple[Sites, Sites], s: Array, knots: Sequence[int], weights: Sequence[Array]) -> float:
+    """Weighted sum of squares of both components at these knots."""
+    B = trend.hats(s, s[list(knots)])
+    basis = Basis(B, np.ones((B.shape[1], 3), bool))
+    total = 0.0
+    for sites, weight in zip(parts, weights, strict=True):
+        beta, _, design = trend.solve(sites, basis, weight)
+        e = sites.value - design @ beta
+        q = np.einsum("ia,iab,ib->i", e, sites.precision, e)
+        total += float(weight @ q)
+    return total
+
+
+def _gains(
+    parts: tuple[Sites, Sites], s: Array, knots: Sequence[int], inner: Sequence[int], weights: Sequence[Array]
+) -> Array:
+    """How much each further kink would lower the sum of squares, to first order exact."""
+    B = trend.hats(s, s[list(knots)])
+    basis = Basis(B, np.ones((B.shape[1], 3), bool))
+    ramps = np.maximum(s[:, None] - s[list(inner)][None, :], 0.0)
+    out = np.zeros(len(inner))
+    for sites, weight in zip(parts, weights, strict=True):
+        beta, cov, design = trend.solve(sites, basis, weight)
+        e = sites.value - design @ beta
+        L = sites.precision * weight[:, None, None]
+        g = np.einsum("ic,iab,ib->ca", ramps, L, e, optimize=True)
+        S = np.einsum("ic,iab->cab", ramps**2, L, optimize=True)
+        cross = np.einsum("ic,iab,ibf->caf", ramps, L, design, optimize=True)
+        S = S - np.einsum("caf,fg,cbg->cab", cross, cov, cross, optimize=True)
+        S[:, [0, 1, 2], [0, 1, 2]] *= 1.0 + 1e-9
+        out += np.einsum("ca,ca->c", g, np.linalg.solve(S, g[:, :, None])[:, :, 0])
+    return out
+
+
+def _shift(
+    parts: tuple[Sites, Sites],
+    s: Array,
+    knots: Sequence[int],
+    weights: Sequence[Array],
+    around: int | None = None,
+) -> tuple[list[int], float]:
+    """Move inner knots by up to three stations where that lowers the cost."""
+    out = list(knots)
+    cost = _cost(parts, s, out, weights)
+    for j in range(1, len(out) - 1):
+        if around is not None and out[j] != around:
+            continue
+        here = out[j]
+        for d in (-3, -2, -1, 1, 2, 3):
+            if not out[j - 1] < here + d < out[j + 1]:
+                continue
+            trial = [*out[:j], here + d, *out[j + 1 :]]
+            after = _cost(parts, s, trial, weights)
+            if after < cost:
+                out, cost = trial, after
+    return out, cost
+
+
+def _drop(
+    parts: tuple[Sites, Sites], s: Array, knots: list[int], weights: Sequence[Array], cost: float
+) -> tuple[list[int], float]:
+    """Take out the knots that do not pay, the least useful first."""
+    while len(knots) > 2:
+        trials = [[*knots[:j], *knots[j + 1 :]] for j in range(1, len(knots) - 1)]
+        after = [_cost(parts, s, t, weights) for t in trials]
+        j = int(np.argmin(after))
+        if after[j] - cost > _KEEP_KNOT:
+            break
+        knots, cost = trials[j], after[j]
+    return knots, cost
+
+
+def _apply(
+    stations: tuple[StationEstimate, ...],
+    sections: Sequence[JointSection],
+    parts: tuple[Sites, Sites],
+    fits: tuple[Trend, Trend],
+) -> tuple[tuple[StationEstimate, ...], tuple[tuple[int, str], ...]]:
+    """Stations with the model's poses, and those that disagree with it."""
+    out: list[StationEstimate] = []
+    outliers: list[tuple[int, str]] = []
+    for i, (station, section) in enumerate(zip(stations, sections, strict=True)):
+        components: list[ComponentEstimate] = []
+        status = station.status
+        for which in (0, 1):
+            c, t = station.components[which], fits[which]
+            if not parts[which].known[i]:
+                components.append(c)
+                continue
+            corner = section.gap.mouth[which]
+            pose = Pose2D.about(corner, *(float(x) for x in t.value[i]))
+            J = np.linalg.inv(_at_corner(pose, corner))
+            if t.distance[i] > _FLAG:
+                outliers.append((i, "AB"[which]))
+                off = float(np.hypot(*(parts[which].value[i] - t.value[i])[:2])) * 1e3
+                reason = f"its own returns put it {off:.1f} mm away from what its neighbours say"
+                if c.status.name == "ok":
+                    c = replace(c, status=Status("ambiguous", reason))
+                if status.name == "ok":
+                    status = Status("ambiguous", f"component {'AB'[which]}: {reason}")
+            components.append(replace(c, pose=pose, covariance=J @ t.covariance[i] @ J.T))
+        out.append(replace(station, components=(components[0], components[1]), status=status))
+    return tuple(out), tuple(outliers)

@@ -1,0 +1,199 @@
+"""Motion along the joint: right model, right accuracy, outliers found, gaps bridged honestly."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from bimfit.config import SensorConfig
+from bimfit.errors import ConfigError
+from bimfit.estimation.motion import estimate_joint
+from bimfit.estimation.result import ComponentEstimate, StationEstimate
+from bimfit.estimation.trend import Basis, Evidence, Sites, bends, fit, hats, polynomial, smooth, solve
+from bimfit.geometry.frame import SectionFrame
+from bimfit.geometry.joint_section import GapOutline, JointSection
+from bimfit.geometry.pose import Pose2D
+from bimfit.geometry.profile import Profile
+from bimfit.geometry.status import OK, Status
+
+FRAME = SectionFrame.from_axes((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+CORNERS = (np.array([-0.0125, 0.0]), np.array([0.0125, 0.0]))
+SD = np.array([0.4e-3, 0.4e-3, 8e-3])
+N = 83
+
+
+def _sections():
+    a = Profile.polygon([(-0.2125, -0.025), (-0.0125, -0.025), (-0.0125, 0.0), (-0.2125, 0.0)])
+    b = Profile.polygon([(0.0125, -0.025), (0.2125, -0.025), (0.2125, 0.0), (0.0125, 0.0)])
+    gap = GapOutline(np.array([CORNERS[0], (-0.0125, -0.025)]), np.array([CORNERS[1], (0.0125, -0.025)]))
+    return [JointSection(0.01 * i, FRAME, (a, b), gap) for i in range(N)]
+
+
+def _stations(rng, truth):
+    """Independent Gaussian estimates about a truth (2, N, 3) of corner motions."""
+    out = []
+    for i in range(N):
+        components = []
+        for k in (0, 1):
+            pose = Pose2D.about(CORNERS[k], *(truth[k, i] + rng.normal(0.0, SD)))
+            arm = pose.turn(CORNERS[k])
+            J = np.linalg.inv(np.array([[1.0, 0.0, -arm[1]], [0.0, 1.0, arm[0]], [0.0, 0.0, 1.0]]))
+            components.append(ComponentEstimate(pose, J @ np.diag(SD**2) @ J.T, OK))
+        out.append(StationEstimate(0.01 * i, Pose2D(), tuple(components), OK, SensorConfig()))
+    return out
+
+
+def _truth(kind, rng):
+    t = np.linspace(0.0, 1.0, N)[None, :, None]
+    a = rng.uniform(-1, 1, (2, 1, 3)) * (6e-3, 6e-3, 0.05)
+    b = rng.uniform(-1, 1, (2, 1, 3)) * (6e-3, 6e-3, 0.05)
+    if kind == "const":
+        return np.repeat(a, N, axis=1)
+    if kind == "linear":
+        return a + (b - a) * t
+    if kind == "rigid":
+        return a + (b - a) * t * np.array([1.0, 1.0, 0.0])
+    if kind == "smooth":
+        return a + 5e-3 * np.sin(np.pi * t) * np.array([1.0, 1.0, 4.0])
+    at = np.sort(np.r_[0, N - 1, rng.choice(np.arange(5, N - 5, 8), 6, replace=False)])
+    values = rng.uniform(-1, 1, (2, len(at), 3)) * (20e-3, 20e-3, 0.12)
+    return np.stack(
+        [[np.interp(np.arange(N), at, values[k, :, c]) for c in range(3)] for k in (0, 1)]
+    ).transpose(0, 2, 1)
+
+
+def _errors(result, truth):
+    return np.array(
+        [
+            [
+                np.array([*(c.pose.apply(CORNERS[k]) - CORNERS[k]), c.pose.theta]) - truth[k, i]
+                for i, c in enumerate(e.components[k] for e in result.stations)
+            ]
+            for k in (0, 1)
+        ]
+    )
+
+
+@pytest.mark.parametrize("kind", ["const", "rigid", "linear", "smooth", "kinked"])
+def test_auto_chooses_the_model_that_made_the_joint_and_gains_by_it(kind):
+    rng = np.random.default_rng(3)
+    truth = _truth(kind, rng)
+    stations = _stations(rng, truth)
+    result = estimate_joint(stations, _sections(), "auto")
+    assert result.model == kind
+    gain = {"const": 5.0, "rigid": 3.5, "linear": 3.5, "smooth": 1.8, "kinked": 1.6}[kind]
+    rms = np.sqrt(np.mean(_errors(result, truth) ** 2, axis=(0, 1)))
+    assert np.all(rms < SD / gain)
+    # standard deviations that say so
+    variance = np.mean([np.diag(c.covariance)[2] for e in result.stations for c in e.components])
+    assert 0.5 < rms[2] / np.sqrt(variance) < 1.6
+
+
+def test_a_jump_is_flagged_and_does_not_pull_its_neighbours():
+    rng = np.random.default_rng(5)
+    truth = _truth("linear", rng)
+    moved = truth.copy()
+    moved[0, 40, 0] += 4e-3
+    result = estimate_joint(_stations(rng, moved), _sections(), "linear")
+    assert (40, "A") in result.outliers
+    assert len(result.outliers) <= 2
+    assert result.stations[40].status.name == "ambiguous"
+    assert "neighbours" in result.stations[40].status.reason
+    assert np.abs(_errors(result, truth)[0, :, 0]).max() < 0.5e-3
+
+
+def test_a_station_without_an_estimate_stays_without_one():
+    rng = np.random.default_rng(6)
+    stations = _stations(rng, _truth("linear", rng))
+    lost = Status("no_data", "no returns")
+    none = ComponentEstimate(status=lost)
+    stations[10] = dataclasses.replace(stations[10], components=(none, none), status=lost)
+    result = estimate_joint(stations, _sections(), "auto")
+    assert result.stations[10].components[0].pose is None
+    assert result.stations[10].status.name == "no_data"
+
+
+def test_independent_changes_nothing_and_unknown_models_are_refused():
+    rng = np.random.default_rng(7)
+    stations = _stations(rng, _truth("const", rng))
+    assert estimate_joint(stations, _sections(), "independent").stations == tuple(stations)
+    with pytest.raises(ConfigError, match="unknown motion model spline"):
+        estimate_joint(stations, _sections(), "spline")
+
+
+def test_stations_that_share_a_beam_cell_do_not_average():
+    """All corners at one bearing: the error across the gap is common, and the covariance must know."""
+    rng = np.random.default_rng(8)
+    stations = _stations(rng, _truth("const", rng))
+
+    def at(step):
+        return [
+            dataclasses.replace(
+                e, components=tuple(dataclasses.replace(c, corner_step=step(i)) for c in e.components)
+            )
+            for i, e in enumerate(stations)
+        ]
+
+    def sd_u(result):
+        c = result.stations[41].components[0]
+        arm = c.pose.turn(CORNERS[0])
+        J = np.array([1.0, 0.0, -arm[1]])
+        return float(np.sqrt(J @ c.covariance @ J))
+
+    same = sd_u(estimate_joint(at(lambda i: 2.25), _sections(), "const"))
+    drifting = sd_u(estimate_joint(at(lambda i: 0.37 * i), _sections(), "const"))
+    assert same == pytest.approx(SD[0], rel=0.05)
+    assert drifting < 0.35 * SD[0]
+
+
+def _random_sites(rng, n=30):
+    s = np.sort(rng.uniform(0.0, 1.0, n))
+    M = rng.normal(size=(n, 3, 3))
+    precision = np.einsum("iab,icb->iac", M, M) * 1e6 + 1e5 * np.eye(3)
+    return Sites(s, rng.normal(0.0, 3e-3, (n, 3)), precision, np.full(n, np.nan))
+
+
+def test_least_squares_agrees_with_numpy():
+    rng = np.random.default_rng(9)
+    sites = _random_sites(rng)
+    basis = Basis(hats(sites.s, sites.s[[0, 9, 20, 29]]), np.ones((4, 3), bool))
+    beta, cov, design = solve(sites, basis, np.ones(30))
+    root = np.linalg.cholesky(sites.precision).transpose(0, 2, 1)
+    A = (root @ design).reshape(90, -1)
+    y = np.einsum("iab,ib->ia", root, sites.value).ravel()
+    assert np.allclose(beta, np.linalg.lstsq(A, y, rcond=None)[0], rtol=1e-6, atol=1e-9)
+    assert np.allclose(cov, np.linalg.inv(A.T @ A), rtol=1e-5)
+
+
+def test_evidence_differences_agree_with_the_dense_gaussian():
+    rng = np.random.default_rng(10)
+    sites = _random_sites(rng, 12)
+    value = Evidence(sites)
+    n = 12
+
+    def dense(q):
+        W = bends(sites.s)
+        P = np.zeros((3 * n, 3 * n))
+        L = np.zeros((3 * n, 3 * n))
+        for a in range(3):
+            P[a::3, a::3] = W / (q[0] if a < 2 else q[1]) ** 2
+        for i in range(n):
+            L[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = sites.precision[i]
+        A = L + P + 1e-3 * np.eye(3 * n)
+        b = L @ sites.value.ravel()
+        ranks = -(n - 2) * (2 * np.log(q[0]) + np.log(q[1]))
+        return 0.5 * b @ np.linalg.solve(A, b) - 0.5 * np.linalg.slogdet(A)[1] + ranks
+
+    one, two = (0.02, 0.3), (0.5, 0.05)
+    assert value(one) - value(two) == pytest.approx(dense(one) - dense(two), rel=1e-8)
+
+
+def test_smooth_model_is_the_straight_line_in_the_limit():
+    rng = np.random.default_rng(12)
+    sites = dataclasses.replace(_random_sites(rng), s=np.linspace(0.0, 1.0, 30))
+    stiff = fit(sites, smooth(sites.s, (1e-4, 1e-4)), rounds=0)
+    line = fit(sites, polynomial(sites.s, turning=True), rounds=0)
+    assert np.allclose(stiff.value, line.value, atol=2e-5)
+    assert stiff.freedom == pytest.approx(6.0, abs=0.05)
