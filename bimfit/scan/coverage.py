@@ -10,7 +10,7 @@ from bimfit.geometry.line_scan import LineScan
 from bimfit.geometry.path import JointPath
 from bimfit.geometry.pose import Array
 from bimfit.scan.cloud import PointCloud
-from bimfit.scan.grid import StationGrid
+from bimfit.scan.grid import StationGrid, within
 from bimfit.scan.sweeps import CHUNK, Anchors, anchor_beams, trace_sweeps
 
 NEAREST_SWEEPS = 1e-3
@@ -18,7 +18,12 @@ NEAREST_SWEEPS = 1e-3
 SLICE_POINTS = 40
 """How many points within reach a slice of a cloud should have."""
 MOST_STATIONS = 1000
-_BIN_POINTS = 3
+_CELL = 0.005
+_CELL_POINTS = 3
+_MOST_BEAMS = 500_000
+_SWEEP_BEAMS = 40
+_SAMPLE = 200_000
+"""Returns near a joint that are looked at closely; a greater number is thinned out to this."""
 
 
 def covers(scan: LineScan | PointCloud, path: JointPath, reach: float = 0.3) -> float:
@@ -31,20 +36,16 @@ def covers(scan: LineScan | PointCloud, path: JointPath, reach: float = 0.3) -> 
     reach : float
         m.
     """
-    s = _along(scan, path, reach)
-    if not len(s):
+    s, _ = _along(scan, path, reach)
+    cells, count = np.unique(np.floor(s / _CELL).astype(np.int64), return_counts=True)
+    places = cells[count >= _CELL_POINTS] * _CELL
+    if not len(places):
         return 0.0
-    bins = int(np.clip(math.ceil(path.length / 0.02), 5, 200))
-    if isinstance(scan, LineScan):
-        # one sweep in a bin is enough, and sweeps may be farther apart than bins
-        grid = _path_grid(path)
-        sweeps = sweep_positions(scan, grid, path, reach)
-        if len(sweeps):
-            step = float(np.median(np.diff(sweeps))) if len(sweeps) > 1 else path.length / bins
-            bins = int(np.clip(math.floor(path.length / max(1.5 * step, 1e-9)), 1, bins))
-            s = np.repeat(sweeps, _BIN_POINTS)
-    count = np.histogram(s, bins, (0.0, path.length))[0]
-    return float(np.mean(count >= _BIN_POINTS))
+    steps = np.diff(places)
+    # sweeps may be farther apart than cells; what lies between two of the usual distance is covered
+    apart = steps[steps > 1.5 * _CELL]
+    usual = 1.5 * float(np.median(apart)) if len(apart) > len(places) / 3 else 4.0 * _CELL
+    return float(min(1.0, (np.minimum(steps, usual).sum() + _CELL) / path.length))
 
 
 def scan_stations(
@@ -74,18 +75,17 @@ def scan_stations(
     if isinstance(scan, LineScan):
         sweeps = sweep_positions(scan, _path_grid(path), path, reach)
     if spacing is not None:
-        s = sweeps if len(sweeps) else _along(scan, path, reach)
+        s = sweeps if len(sweeps) else _along(scan, path, reach)[0]
         return _on_grid(s, spacing, path.length)
     if len(sweeps):
         return _merged(sweeps, max(NEAREST_SWEEPS, path.length / MOST_STATIONS))
-    s = _along(scan, path, reach)
+    s, count = _along(scan, path, reach)
     if not len(s):
         return s
     low, high = np.quantile(s, [0.002, 0.998])
     extent = max(float(high - low), 1e-9)
-    wanted = len(s) / SLICE_POINTS
-    count = int(np.clip(wanted, 1, min(MOST_STATIONS, max(1.0, extent / NEAREST_SWEEPS))))
-    return np.asarray(low + extent * (np.arange(count) + 0.5) / count)
+    stations = int(np.clip(count / SLICE_POINTS, 1, min(MOST_STATIONS, max(1.0, extent / NEAREST_SWEEPS))))
+    return np.asarray(low + extent * (np.arange(stations) + 0.5) / stations)
 
 
 def sweep_positions(scan: LineScan, grid: StationGrid, path: JointPath, reach: float) -> Array:
@@ -93,6 +93,7 @@ def sweep_positions(scan: LineScan, grid: StationGrid, path: JointPath, reach: f
 
     A sweep that is no farther beyond an end than half the usual distance between sweeps counts as at the end.
     """
+    scan = _thinned(scan)
     anchors = anchor_beams(scan, grid, reach)
     if not _any_return(scan, anchors):
         return np.zeros(0)
@@ -103,6 +104,16 @@ def sweep_positions(scan: LineScan, grid: StationGrid, path: JointPath, reach: f
     slack = 0.5 * float(np.median(steps)) if len(steps) else NEAREST_SWEEPS
     s = s[(s >= -slack) & (s <= path.length + slack)]
     return np.asarray(np.clip(s, 0.0, path.length))
+
+
+def _thinned(scan: LineScan) -> LineScan:
+    """A large scan with fewer beams a sweep: enough to tell where each sweep lies."""
+    numbers = int(np.count_nonzero(np.diff(scan.scan))) + 1
+    stride = min(len(scan) // _MOST_BEAMS, len(scan) // numbers // _SWEEP_BEAMS)
+    if stride < 2:
+        return scan
+    part = slice(None, None, stride)
+    return LineScan(scan.scan[part], scan.origins[part], scan.directions[part], scan.ranges[part])
 
 
 def _any_return(scan: LineScan, anchors: Anchors) -> bool:
@@ -116,27 +127,36 @@ def _path_grid(path: JointPath) -> StationGrid:
     return StationGrid.of([path.rough_frame(float(x)) for x in s], s)
 
 
-def _along(scan: LineScan | PointCloud, path: JointPath, reach: float) -> Array:
-    """Where along a path its neighbouring returns are, shape (m,); beyond its ends there are none."""
+def _along(scan: LineScan | PointCloud, path: JointPath, reach: float) -> tuple[Array, float]:
+    """Where along a path its neighbouring returns are, and about how many there are.
+
+    Returns
+    -------
+    s : ndarray, shape (m,)
+        Of an even sample of them, m; beyond the path's ends there are none.
+    count : float
+    """
     low, high = path.points.min(axis=0) - reach, path.points.max(axis=0) + reach
-    ends = [path.rough_frame(0.0), path.rough_frame(path.length)]
-    out = []
+    found = []
     for start in range(0, len(scan), CHUNK):
         chunk = slice(start, start + CHUNK)
         if isinstance(scan, PointCloud):
             p = scan.points[chunk]
         else:
             p = scan.origins[chunk] + scan.directions[chunk] * scan.ranges[chunk, None]
-        p = p[((p >= low) & (p <= high)).all(axis=1)]
-        if not len(p):
-            continue
-        s, distance = path.project(p)
-        near = distance <= reach
-        if not path.closed:
-            near &= ~((s <= 0.0) & ((p - ends[0].origin) @ ends[0].n < 0.0))
-            near &= ~((s >= path.length) & ((p - ends[1].origin) @ ends[1].n > 0.0))
-        out.append(s[near])
-    return np.concatenate(out) if out else np.zeros(0)
+        found.append(p[within(p, low, high)])
+    p = np.concatenate(found) if found else np.zeros((0, 3))
+    stride = max(1, len(p) // _SAMPLE)
+    # drawn at random: files are ordered, and a fixed stride may walk along that order
+    if stride > 1:
+        p = p[np.sort(np.random.default_rng(0).integers(0, len(p), len(p) // stride))]
+    s, distance = path.project(p)
+    near = distance <= reach
+    if not path.closed:
+        ends = [path.rough_frame(0.0), path.rough_frame(path.length)]
+        near &= ~((s <= 0.0) & ((p - ends[0].origin) @ ends[0].n < 0.0))
+        near &= ~((s >= path.length) & ((p - ends[1].origin) @ ends[1].n > 0.0))
+    return s[near], float(np.count_nonzero(near)) * stride
 
 
 def _on_grid(s: Array, spacing: float, length: float) -> Array:

@@ -14,7 +14,7 @@ from bimfit.geometry.pose import Array
 from bimfit.geometry.slice import Beams, Slice
 from bimfit.scan.cloud import PointCloud
 from bimfit.scan.coverage import covers, scan_stations
-from bimfit.scan.grid import Ids, StationGrid, ray_enters
+from bimfit.scan.grid import Ids, StationGrid, grouped, ray_enters, within
 from bimfit.scan.sweeps import CHUNK, Anchors, Sweeps, anchor_beams, trace_sweeps
 
 __all__ = ["covers", "cut_slices", "scan_stations"]
@@ -92,8 +92,8 @@ def _cut_beams(scan: LineScan, grid: StationGrid, thickness: float | None, reach
     enters = ray_enters(origin, direction, (-reach, -reach), (reach, reach))
     keep = np.flatnonzero(~steep & np.isfinite(enters) & ~(ranges < enters))
 
-    order = keep[np.argsort(k[keep], kind="stable")]
-    bounds = np.searchsorted(k[order], np.arange(len(grid) + 1))
+    order, bounds = grouped(k[keep], len(grid))
+    order = keep[order]
     numbers = scan.scan[index]
     slices = []
     for i, s in enumerate(grid.s.tolist()):
@@ -158,27 +158,30 @@ def _cut_cloud(
     owners, places = [], []
     for start in range(0, len(cloud), CHUNK):
         points = cloud.points[start : start + CHUNK]
-        points = points[((points >= low) & (points <= high)).all(axis=1)]
+        points = points[within(points, low, high)]
         if not len(points):
             continue
         nearest = grid.nearest(points)
         for offset in range(-spread, spread + 1):
             k = nearest + offset
             valid = (k >= 0) & (k < len(grid))
-            k, chosen = k[valid], points[valid]
+            chosen = points
+            if not valid.all():
+                k, chosen = k[valid], points[valid]
             local = grid.local(chosen, k)
-            inside = (np.abs(local[:, :2]) <= reach).all(axis=1) & (np.abs(local[:, 2]) <= 0.5 * thick)
+            half = (reach, reach, 0.5 * thick)
+            inside = within(local, np.negative(half), half)
             owners.append(k[inside])
             places.append(local[inside, :2])
     k = np.concatenate(owners) if owners else np.zeros(0, np.int64)
     uv = np.concatenate(places) if places else np.zeros((0, 2))
-    order = np.argsort(k, kind="stable")
-    bounds = np.searchsorted(k[order], np.arange(len(grid) + 1))
+    order, bounds = grouped(k, len(grid))
+    uv = uv[order]
     eyes = None
     if cloud.viewpoint is not None:
         everywhere = np.broadcast_to(cloud.viewpoint, (len(grid), 3))
         eyes = grid.local(everywhere, np.arange(len(grid)))[:, :2]
     return tuple(
-        Slice(s, uv[order[bounds[i] : bounds[i + 1]]], None, None if eyes is None else eyes[i])
+        Slice(s, uv[bounds[i] : bounds[i + 1]].copy(), None, None if eyes is None else eyes[i])
         for i, s in enumerate(grid.s.tolist())
     )

@@ -9,7 +9,7 @@ import numpy as np
 
 from bimfit.geometry.line_scan import LineScan
 from bimfit.geometry.pose import Array
-from bimfit.scan.grid import Ids, Mask, StationGrid, ray_enters
+from bimfit.scan.grid import Ids, Mask, StationGrid, ray_enters, within
 
 CHUNK = 1 << 20
 TRANSVERSE = math.tan(math.radians(10.0))
@@ -70,9 +70,9 @@ def _anchor(o: Array, d: Array, r: Array, grid: StationGrid, reach: float) -> tu
     p = hits.copy()
     crosses = np.zeros(len(o), bool)
     for _ in range(2 if grid.straight else 5):  # the frame decides the crossing, the crossing the frame
-        lean = np.einsum("ij,ij->i", d, grid.v[k])
+        lean = grid.turn(d, k)[:, 1]
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            t = np.einsum("ij,ij->i", grid.origins[k] - o, grid.v[k]) / lean
+            t = -grid.local(o, k)[:, 1] / lean
         crosses = (np.abs(lean) > _FLAT) & (t > 0.0)
         p = np.where(crosses[:, None], o + d * np.where(crosses, t, 0.0)[:, None], hits)
         k = np.where(crosses, grid.nearest(p), k)
@@ -80,7 +80,7 @@ def _anchor(o: Array, d: Array, r: Array, grid: StationGrid, reach: float) -> tu
     crosses &= np.abs(local[:, 0]) <= reach
     # An upstand's face is met before v = 0 is: there the return says where.
     seen = grid.local(hits, at_hit)
-    by_hit = ~crosses & hit & (np.abs(seen[:, :2]) <= reach).all(axis=1)
+    by_hit = ~crosses & hit & within(seen[:, :2], (-reach, -reach), (reach, reach))
     k = np.where(by_hit, at_hit, k)
     local = np.where(by_hit[:, None], seen, local)
     passing = np.flatnonzero(~crosses & ~by_hit)
