@@ -24,8 +24,9 @@ def ladder(run: Sequence[GapSection]) -> list[Rungs]:
     every sign is certain.
     """
     rows = []
-    for section, (share_a, share_b) in zip(run, _shares(run), strict=True):
-        pa, pb = _at(section.side_a, share_a), _at(section.side_b, share_b)
+    own = [(_lengths(section.side_a), _lengths(section.side_b)) for section in run]
+    for section, (own_a, own_b), (share_a, share_b) in zip(run, own, _shares(own), strict=True):
+        pa, pb = _at(section.side_a, own_a, share_a), _at(section.side_b, own_b, share_b)
         world = section.frame.to_world
         plane = np.concatenate([pa, pb[::-1]])
         rows.append(Rungs(world(pa), world(pb), _opening(section, pa, pb), section.frame.n, plane))
@@ -34,9 +35,12 @@ def ladder(run: Sequence[GapSection]) -> list[Rungs]:
 
 def _opening(section: GapSection, pa: Array, pb: Array) -> Array:
     """Signed width along the common normal; A's side has the gap on its left, walking from the mouth."""
-    tangent = np.gradient(pa, axis=0) + np.gradient(pb, axis=0)
+    both = pa + pb
+    tangent = np.empty_like(both)
+    tangent[1:-1] = both[2:] - both[:-2]
+    tangent[0], tangent[-1] = both[1] - both[0], both[-1] - both[-2]
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
-    size = np.linalg.norm(normal, axis=1)
+    size = np.sqrt(np.einsum("ij,ij->i", normal, normal))
     w = np.einsum("ij,ij->i", pb - pa, normal) / np.where(size > 1e-12, size, 1.0)
     if section.closed:
         w = np.minimum(w, -CLOSED)
@@ -46,14 +50,14 @@ def _opening(section: GapSection, pa: Array, pb: Array) -> Array:
     return np.where(np.abs(w) < CLOSED, -CLOSED, w)
 
 
-def _shares(run: Sequence[GapSection]) -> list[tuple[Array, Array]]:
-    own = [(_lengths(section.side_a), _lengths(section.side_b)) for section in run]
+def _shares(own: list[tuple[Array, Array]]) -> list[tuple[Array, Array]]:
+    """For each section the shares of A's and of B's length at which its rungs stand."""
     if len({(len(fa), len(fb)) for fa, fb in own}) == 1:
         indexed = _by_vertex(own)
         if indexed is not None:
             return indexed
     common = _thin(np.unique(np.concatenate([np.round(f, 6) for pair in own for f in pair])))
-    return [(common, common)] * len(run)
+    return [(common, common)] * len(own)
 
 
 def _by_vertex(own: list[tuple[Array, Array]]) -> list[tuple[Array, Array]] | None:
@@ -82,7 +86,8 @@ def _by_vertex(own: list[tuple[Array, Array]]) -> list[tuple[Array, Array]] | No
 
 def _lengths(side: Array) -> Array:
     """Share of a side's length at each of its vertices."""
-    steps = np.linalg.norm(np.diff(side, axis=0), axis=1)
+    step = side[1:] - side[:-1]
+    steps = np.sqrt(np.einsum("ij,ij->i", step, step))
     total = float(steps.sum())
     if total <= 0.0:
         return np.linspace(0.0, 1.0, len(side))
@@ -91,8 +96,9 @@ def _lengths(side: Array) -> Array:
     return out
 
 
-def _at(side: Array, share: Array) -> Array:
-    own = _lengths(side)
+def _at(side: Array, own: Array, share: Array) -> Array:
+    if np.array_equal(own, share):
+        return side
     return np.stack([np.interp(share, own, side[:, 0]), np.interp(share, own, side[:, 1])], axis=1)
 
 

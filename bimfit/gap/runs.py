@@ -73,16 +73,16 @@ def find_runs(
     bridged: list[Span] = []
     unmeasured: list[Span] = []
     found = [section for _, section in order]
-    for here, (length, count) in zip(found, steps, strict=False):
+    for n, (here, (length, count)) in enumerate(zip(found, steps, strict=False)):
         span = (here.s, here.s + length)
         torn = count > 1 and length > limit * (1.0 + 1e-9)
         if count > 1:
             (unmeasured if torn else bridged).append(span)
-        seam = here is found[-1]
+        seam = n == len(found) - 1
         if torn and not seam:
             runs.append([])
         if not seam:
-            runs[-1].append(found[found.index(here) + 1])
+            runs[-1].append(found[n + 1])
         elif not torn:
             # The seam of a ring: the last run leads into the first.
             if len(runs) == 1:
