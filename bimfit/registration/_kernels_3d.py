@@ -359,14 +359,15 @@ def bound_node(points, rho, weights, pivot, pose, half, V, tables, R, J, slope):
     Parameters
     ----------
     half : (d,) half widths along the columns of ``V`` (6, d)
-    tables : classes' radii, look-up of the class, blocks, pads, shapes, offsets, bricks, records, scale
+    tables : classes' radii, look-up of the class, blocks and their inverses, pads, shapes, offsets,
+        bricks, records, scale
     slope : (d,) receives the bound's slope along each column
 
     Returns
     -------
     The constant part of the bound: it is that plus sum |slope| half.
     """
-    radii, choose, per_cell, blocks, pads, shapes, starts, bricks, records, g_scale = tables
+    radii, choose, per_cell, blocks, inverses, pads, shapes, starts, bricks, records, g_scale = tables
     rotation(pose[3:], R, J)
     d = half.shape[0]
     ht = np.zeros(3)
@@ -415,9 +416,10 @@ def bound_node(points, rho, weights, pivot, pose, half, V, tables, R, J, slope):
         if x < 0.0 or y < 0.0 or z < 0.0:
             continue
         block = blocks[c]
-        bx = int(x / block)
-        by = int(y / block)
-        bz = int(z / block)
+        inverse = inverses[c]
+        bx = int(x * inverse)
+        by = int(y * inverse)
+        bz = int(z * inverse)
         ix = bx >> 2
         iy = by >> 2
         iz = bz >> 2

@@ -27,7 +27,6 @@ from bimfit.registration import _kernels_3d as kernels
 from bimfit.registration.result import MatchResult, Mode, Stop
 from bimfit.registration.rigid_3d import (
     WEAK_POINTS,
-    WEAK_SHARE,
     Refined,
     Refiner,
     about,
@@ -39,9 +38,13 @@ from bimfit.registration.table_3d import Target3D
 
 _CHUNK = 1000
 _STARTS = 8
-_ROTATION_WEIGHT = 1.75
+_ROTATION_WEIGHT = 0.85
 _MAX_MODES = 64
 _LEAST_SHARE = 0.1
+_GOOD_SHARE = 0.5
+_SCOUTING = 3000
+_NO_LOSS = 0.5
+"""Scores that differ by less than this many points are as good."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +93,10 @@ class Problem3D:
     def total(self) -> float:
         """No pose scores more than this."""
         return float(self.weights.sum())
+
+    def worth(self, points: float) -> float:
+        """Score of so many points of mean weight that lie on the surface."""
+        return points * self.total / max(len(self.points), 1)
 
     @property
     def packed(self) -> tuple[Any, ...]:
@@ -216,13 +223,50 @@ def match_3d(
     if not len(problem.points):
         status = Status("no_data", "there are no points to match")
         return MatchResult("grcsm-3d", np.full(6, np.nan), status=status)
+    conditional, at, score, spent, names = _prepare(problem, eps, limit, deadline)
+    outcome = _Search(conditional, at, score, spent).run(eps, delta, limit, deadline)
+    pose = _polished(problem, conditional, outcome)
+    seconds = time.perf_counter() - begun
+    return _result(problem, conditional, outcome, pose, names, refine, seconds)
+
+
+def _prepare(
+    problem: Problem3D, eps: float, limit: float, deadline: float | None
+) -> tuple[Problem3D, Array, float, int, tuple[str, ...]]:
+    """An incumbent, and the search without what the data leave open there.
+
+    A poor incumbent says nothing of what the data fix, so that the search itself betters it first.
+    """
     at, score, spent = _incumbent(problem, limit)
+    if score < _GOOD_SHARE * problem.total and len(at):
+        first = _Search(problem, at, score, spent).run(eps, 0.0, min(limit, spent + _SCOUTING), deadline)
+        at, score, spent = first.at, first.score, first.evaluations
     flat, names = flat_directions(problem, problem.pose(at))
-    if flat.shape[1]:
-        problem = _without(problem, at, flat)
-        at, score = np.zeros(len(problem.steps)), problem.score(problem.x0)
-    outcome = _Search(problem, at, score, spent).run(eps, delta, limit, deadline)
-    return _result(problem, outcome, names, refine, time.perf_counter() - begun)
+    if not flat.shape[1]:
+        return problem, at, score, spent, names
+    at = _at_prior(problem, at, score, flat)
+    conditional = _without(problem, at, flat)
+    score = problem.score(problem.pose(at))
+    return conditional, np.zeros(len(conditional.steps)), score, spent + 1, names
+
+
+def _at_prior(problem: Problem3D, at: Array, score: float, flat: Array) -> Array:
+    """Undo a climb's drift along flat directions, where the prior is as good."""
+    scale = _scales(problem) * problem.steps
+    back = at - (flat @ (flat.T @ (at * scale))) / scale
+    return back if problem.score(problem.pose(back)) >= score - problem.worth(_NO_LOSS) else at
+
+
+def _polished(problem: Problem3D, conditional: Problem3D, outcome: _Outcome) -> Array:
+    """The best pose (6,); where directions were held, after a last climb along all of them."""
+    pose = conditional.pose(outcome.at)
+    if conditional is problem or not len(problem.steps):
+        return pose
+    around = replace(problem, x0=pose)
+    at = np.zeros(len(problem.steps))
+    field, points, _, weights, pivot, x0, V, steps, _ = around.packed
+    score, _ = kernels.climb(field, points, weights, pivot, x0, V, steps, np.full(len(at), 8.0), at, 4)
+    return around.pose(at) if score > outcome.score + problem.worth(_NO_LOSS) else pose
 
 
 def make_problem(
@@ -317,8 +361,9 @@ def _incumbent(problem: Problem3D, limit: float) -> tuple[Array, float, int]:
 def flat_directions(problem: Problem3D, pose: Array) -> tuple[Array, tuple[str, ...]]:
     """The searched directions that the score hardly depends on at a pose (6,).
 
-    The score's curvature over half a blur is an effective number of points that fix a direction;
-    directions of less than ``WEAK_POINTS``, or ``WEAK_SHARE`` of all, are flat.
+    The score's curvature over half a blur is an effective number of points that fix a direction. A
+    direction is flat where they are too few to fix it within the tolerance (the noise taken as half the
+    blur), but never for lack of more than one in a hundred, and always under ``WEAK_POINTS``.
 
     Returns
     -------
@@ -348,8 +393,12 @@ def flat_directions(problem: Problem3D, pose: Array) -> tuple[Array, tuple[str, 
                 - score(-unit[i] - unit[j])
             ) / (4.0 * h**2)
     values, vectors = np.linalg.eigh(H) if d else (np.zeros(0), np.zeros((0, 0)))
-    limit = max(WEAK_POINTS * problem.total / len(problem.points), WEAK_SHARE * middle)
-    flat = vectors[:, values * blur**2 < limit]
+    # Fixed to within a tolerance: so many points of half a blur's spread does it take.
+    needed = (0.5 * blur / float(np.median(problem.steps * scale))) ** 2 if d else 0.0
+    limit = problem.worth(max(WEAK_POINTS, min(needed, 0.01 * len(problem.points))))
+    # Far from a summit the score curves upwards too, but there it changes.
+    still = [max(abs(score(h * v) - middle), abs(score(-h * v) - middle)) < 0.5 * limit for v in vectors.T]
+    flat = vectors[:, (values * blur**2 < limit) & np.array(still, bool)]
     return flat, tuple(direction_name(problem.V @ column) for column in flat.T)
 
 
@@ -474,19 +523,24 @@ def _lever(points: Array, axis: Array) -> float:
 
 
 def _result(
-    problem: Problem3D, outcome: _Outcome, names: tuple[str, ...], refine: bool, seconds: float
+    problem: Problem3D,
+    conditional: Problem3D,
+    outcome: _Outcome,
+    pose: Array,
+    names: tuple[str, ...],
+    refine: bool,
+    seconds: float,
 ) -> MatchResult:
     target = problem.target
     cloud = problem.points * target.spacing + target.origin + problem.pivot * target.spacing
     cloud = transform_points(problem.prior, cloud)
     refiner = Refiner(target.surface)
-    pose = problem.pose(outcome.at)
     T = problem.T_model_scan(pose)
     fitted = refiner.judge(cloud, T, 0.5 * target.blur)
     if refine:
         fitted = _refined(problem, refiner, cloud, T, outcome.score, fitted)
     modes = tuple(
-        Mode(parameters_of(rigid_inverse(problem.T_model_scan(problem.pose(at)))), score)
+        Mode(parameters_of(rigid_inverse(problem.T_model_scan(conditional.pose(at)))), score)
         for score, at in outcome.rivals
     )
     return MatchResult(
@@ -496,8 +550,8 @@ def _result(
         bound=outcome.bound,
         evaluations=outcome.evaluations,
         stop=outcome.stop,
-        status=_status(problem, outcome, names),
-        levels=tuple(int(np.ceil(np.log2(2.0 * r + 1.0))) for r in problem.reach),
+        status=_status(conditional, outcome, names),
+        levels=tuple(int(np.ceil(np.log2(2.0 * r + 1.0))) for r in conditional.reach),
         fitness=float(np.mean(fitted.inlier)),
         inlier_rmse=fitted.rmse,
         modes=modes,

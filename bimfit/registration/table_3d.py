@@ -1,8 +1,8 @@
 """Look-up tables of a component in space: its blurred visible surface and majorants of it.
 
-The field is a lattice of exp(-d^2 / 2 blur^2) (cut off and lowered to zero at three blurs), read
-trilinearly. For a dozen radii r a sparse table holds, a block of the lattice each, an affine function that
-is nowhere under the field within the block widened by r (METHOD, section 9).
+The field is a lattice of exp(-d^2 / 2 blur^2) (cut off and lowered to zero at 2.5 blurs), read
+trilinearly. For each of some radii r a sparse table holds, a block of the lattice each, an affine function
+that is nowhere under the field within the block widened by r (METHOD, section 9).
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from bimfit.geometry.pose import Array
 from bimfit.registration import _kernels_3d as kernels
 from bimfit.registration.surface_3d import Surface, visible_surface
 
-RADII = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0)
-"""Radius classes, lattice cells."""
-BLOCKS = (1, 1, 1, 1, 1, 2, 2, 4, 4, 8, 8, 16)
+RADII = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0)
+"""Radius classes, lattice cells. Finer ones gain no evaluations, and cost most of memory and building."""
+BLOCKS = (1, 1, 2, 2, 4, 4, 8, 8, 16)
 """Block sides of the classes, lattice cells."""
 PER_CELL = 8.0
-REACH = 3.0
+REACH = 2.5
 """Blurs after which the field is zero."""
 _MAX_NODES = 24_000_000
 _VERSION = 1
@@ -70,6 +70,7 @@ class Tables3D:
             choose,
             PER_CELL,
             blocks,
+            1.0 / blocks,  # exact: sides are powers of two
             self.pads,
             self.shapes,
             self.starts,
@@ -110,6 +111,7 @@ class Target3D:
         *,
         viewpoint: ArrayLike | None = None,
         spacing: float | None = None,
+        max_bytes: int = 128 * 2**20,
         cache: str | Path | None = None,
     ) -> Target3D:
         """Build the tables of a mesh, of surface samples, or of a cloud that stands for a model.
@@ -124,7 +126,10 @@ class Target3D:
         viewpoint : array_like, shape (3,), optional
             The sensor in the model's frame: only what it sees of a mesh is kept.
         spacing : float, optional
-            Of the lattice; default a third of the blur, coarser where the tables would grow too large.
+            Of the lattice; default a third of the blur, coarser where that would take too much memory.
+        max_bytes : int
+            What field and tables may take, about, when ``spacing`` is not given. A large component is
+            better cut down to what the scan shows of it.
         cache : path, optional
             A folder in which built tables are kept and found again.
 
@@ -138,11 +143,11 @@ class Target3D:
         if not (np.isfinite(blur) and blur > 0.0 and (spacing is None or spacing > 0.0)):
             raise ConfigError(f"blur and spacing must be positive, got {blur} and {spacing}")
         corners = _corners(shape)
-        cell = spacing or _affordable(corners, blur)
-        nodes = float(np.prod((corners[1] - corners[0] + 2.0 * REACH * blur) / cell + 4.0))
-        if nodes > 1.05 * _MAX_NODES:
+        cell = spacing or _affordable(corners, _area(shape, viewpoint), blur, max_bytes)
+        if _nodes(corners, blur, cell) > _MAX_NODES:
             raise ModelError(
-                f"a lattice of {nodes:.0f} nodes is too large", remedy="give a larger spacing or blur"
+                f"a lattice of {_nodes(corners, blur, cell):.0f} nodes is too large",
+                remedy="give a larger spacing or blur, or a part of the component",
             )
         surface = _surface_of(shape, cell, viewpoint)
         where = None if cache is None else Path(cache) / f"target3d-{_key(surface, blur, cell)}.npz"
@@ -172,12 +177,31 @@ def _corners(shape: TriangleMesh | Surface | ArrayLike) -> Array:
     return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
-def _affordable(corners: Array, blur: float) -> float:
-    """A third of the blur, or what keeps the lattice within its greatest size."""
+def _nodes(corners: Array, blur: float, cell: float) -> float:
+    return float(np.prod((corners[1] - corners[0] + 2.0 * REACH * blur) / cell + 5.0))
+
+
+def _area(shape: TriangleMesh | Surface | ArrayLike, viewpoint: ArrayLike | None) -> float:
+    """Visible area, m^2, from a few thousand samples; 0 for a bare cloud."""
+    if isinstance(shape, Surface):
+        return len(shape) * shape.spacing**2
+    if not isinstance(shape, TriangleMesh):
+        return 0.0
+    whole = float(np.linalg.norm(shape.face_vectors, axis=1).sum())
+    spacing = max(np.sqrt(whole / 5000.0), 1e-6)
+    return float(len(visible_surface(shape, spacing, viewpoint)) * spacing**2)
+
+
+def _affordable(corners: Array, area: float, blur: float, max_bytes: int) -> float:
+    """A third of the blur, or the least coarser spacing that the memory allows."""
     cell = blur / 3.0
-    while np.prod((corners[1] - corners[0] + 2.0 * REACH * blur) / cell + 4.0) > _MAX_NODES:
-        cell *= 1.1
-    return cell
+    while True:
+        nodes = _nodes(corners, blur, cell)
+        # Two records of 8 bytes a cell of the layer around the surface (the finest classes), and a little.
+        layer = area / cell**2 * (2.0 * REACH * blur / cell + 3.0)
+        if nodes <= _MAX_NODES and 4.0 * nodes + 36.0 * layer <= max_bytes:
+            return cell
+        cell *= 1.05
 
 
 def _surface_of(
