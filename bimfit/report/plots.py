@@ -31,6 +31,7 @@ from bimfit.report.style import (
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -240,6 +241,7 @@ def plot_slice(
         plain_axes(ax, x="u across the joint (mm)" if near else "", y="v out of the mouth (mm)")
         ax.set_aspect("equal", adjustable="box")
     _frame_close(close, slice_, designed, gap, reach)
+    _fit_heights(figure, (whole, close))
     heading(figure, title)
     heading(whole, "The slice")
     heading(close, "The joint")
@@ -258,6 +260,18 @@ def plot_slice(
             bbox={"boxstyle": "round,pad=0.5", "fc": "white", "ec": GREY, "lw": 0.6, "alpha": 0.92},
         )
     return save(figure, path)
+
+
+def _fit_heights(figure: Figure, axes: Sequence[Axes]) -> None:
+    """Give drawings of true shape the same width, and the figure the height that they need."""
+    shapes = []
+    for ax in axes:
+        (u0, u1), (v0, v1) = ax.get_xlim(), ax.get_ylim()
+        shapes.append((v1 - v0) / (u1 - u0))
+    grid = axes[0].get_gridspec()
+    if grid is not None:
+        grid.set_height_ratios(shapes)
+    figure.set_size_inches(9.0, min(6.6 * sum(shapes) + 1.6, 14.0))
 
 
 def _draw_profiles(ax: Axes, designed: Sequence[Profile], fitted: Sequence[Profile]) -> None:

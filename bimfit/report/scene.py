@@ -77,6 +77,8 @@ class View:
         Degrees: from the joint's direction towards its side, and above it.
     size : tuple of int
         Pixels.
+    sensor : bool
+        Whether the sensor's path is drawn, and the picture made wide enough for it.
     """
 
     focus: Literal["joint", "gap"] = "joint"
@@ -84,6 +86,7 @@ class View:
     azimuth: float = 38.0
     elevation: float = 32.0
     size: tuple[int, int] = (1600, 1000)
+    sensor: bool = False
 
 
 _DEFAULT = View()
@@ -164,7 +167,7 @@ def _compose(scene: JointScene, view: View, *, off_screen: bool, path: Path | No
     plotter.enable_anti_aliasing("ssaa" if off_screen else "fxaa")
     _add_elements(plotter, scene, view, origin)
     _add_skins(plotter, scene, view, origin)
-    _add_lines(plotter, scene, origin)
+    _add_lines(plotter, scene, view, origin)
     if scene.points is not None and len(scene.points):
         plotter.add_points(
             scene.points - origin, color=SCAN, point_size=6.0, render_points_as_spheres=True, ambient=0.4
@@ -242,10 +245,10 @@ def _open_ring(ring: Array) -> Array:
     return ring[:-1] if len(ring) > 1 and np.array_equal(ring[0], ring[-1]) else ring
 
 
-def _add_lines(plotter: Any, scene: JointScene, origin: Array) -> None:
+def _add_lines(plotter: Any, scene: JointScene, view: View, origin: Array) -> None:
     _add_polylines(plotter, scene.outlines, origin, GREY, 1.0)
     _add_polylines(plotter, scene.marked, origin, INK, 2.4)
-    if scene.sensor is not None:
+    if scene.sensor is not None and view.sensor:
         _add_polylines(plotter, [scene.sensor], origin, SCAN, 1.5)
 
 
@@ -307,6 +310,8 @@ def _aim(plotter: Any, scene: JointScene, view: View, origin: Array) -> None:
     shown = shown or [e.vertices for e in scene.elements if len(e.vertices)]
     shown = shown or [ring for rings in scene.as_built for ring in rings if len(ring)]
     shown = shown or [p for p in (scene.points, *scene.outlines, *scene.marked) if p is not None and len(p)]
+    if view.sensor and scene.sensor is not None:
+        shown = [*shown, scene.sensor]
     points = np.concatenate(shown) - origin
     right = np.cross(up, toward)
     right /= np.linalg.norm(right)

@@ -50,18 +50,21 @@ def plot_tables(
     ----------
     path : str or Path
     levels : sequence of TableLevel
-        In any order; drawn as given.
+        Drawn as given, over the extent of the last.
 
     Raises
     ------
     ExportError
         When it cannot be written.
     """
-    columns = min(len(levels), 3)
-    rows = -(-len(levels) // columns)
     u0, u1, v0, v1 = levels[-1].extent
-    shape = min(max((v1 - v0) / max(u1 - u0, 1e-9), 0.35), 1.4)
-    figure = new_figure(3.5 * columns, (3.5 * shape + 0.55) * rows + 0.5, layout="compressed")
+    shape = min(max((v1 - v0) / max(u1 - u0, 1e-9), 0.1), 1.4)
+    # Flat tables lie one under the other, square ones side by side.
+    columns = min(len(levels), 1 if shape < 0.35 else 3)
+    rows = -(-len(levels) // columns)
+    panel = 8.0 if columns == 1 else 3.5
+    size = (panel * columns + 0.6, (0.88 * panel * shape + 0.55) * rows + 0.5)
+    figure = new_figure(*size, layout="compressed")
     grid = np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).ravel()
     image = None
     top = max(float(level.values.max()) for level in levels)
@@ -91,8 +94,8 @@ def plot_tables(
                 color="#c0392b",
                 label="scan, best pose",
             )
-        ax.set_xlim(u0, u1)
-        ax.set_ylim(v0, v1)
+        ax.set_xlim(*(1e3 * x for x in levels[-1].extent[:2]))
+        ax.set_ylim(*(1e3 * x for x in levels[-1].extent[2:]))
         plain_axes(ax, x="u (mm)", y="v (mm)", grid=False)
         heading(ax, level.label)
     for ax in grid[len(levels) :]:
@@ -102,10 +105,18 @@ def plot_tables(
         bar.set_label("score of a return in the cell", fontsize=8.5, color=INK)
         bar.ax.tick_params(labelsize=8, colors=INK)
         bar.outline.set_visible(False)
-    for ax, level in zip(grid, levels, strict=False):
-        if level.points is not None or level.start is not None:
-            legend(ax, loc="lower left", markerscale=2.5, frameon=True, framealpha=0.9, edgecolor="none")
-            break
+    handles, labels = grid[len(levels) - 1].get_legend_handles_labels()
+    if handles:
+        figure.legend(
+            handles,
+            labels,
+            loc="outside upper right",
+            ncols=len(handles),
+            markerscale=2.5,
+            fontsize=8,
+            frameon=False,
+            labelcolor=INK,
+        )
     heading(figure, title)
     return save(figure, path)
 
