@@ -9,6 +9,7 @@ import numpy as np
 from bimfit.geometry.pose import Array
 
 _HEAL = 1e-4
+_LATTICE = 1e-6
 _SIMPLIFY = 2e-4
 _END_TURN = np.radians(45.0)
 
@@ -26,8 +27,7 @@ def middle_line(polygons: list[Array], *, max_depth: float) -> tuple[Array, bool
     """
     import shapely
 
-    merged: Any = shapely.union_all([shapely.Polygon(p).buffer(_HEAL, join_style="mitre") for p in polygons])
-    merged = merged.buffer(-_HEAL, join_style="mitre").simplify(_SIMPLIFY)
+    merged = _union([shapely.Polygon(p) for p in polygons]).simplify(_SIMPLIFY)
     if merged.geom_type == "MultiPolygon":
         merged = max(merged.geoms, key=lambda g: g.area)
     if merged.is_empty or merged.geom_type != "Polygon":
@@ -48,6 +48,20 @@ def middle_line(polygons: list[Array], *, max_depth: float) -> tuple[Array, bool
     if depth > max_depth or length < 2.0 * depth:
         return None
     return line, bool(holes)
+
+
+def _union(pieces: list[Any]) -> Any:
+    """Union of polygons that leaves no slits between them."""
+    import shapely
+
+    try:
+        merged = shapely.union_all(pieces, grid_size=_LATTICE)
+    except shapely.errors.GEOSException:  # the lattice can tie a region into knots
+        merged = None
+    if merged is not None and merged.geom_type == "Polygon":
+        return merged
+    wide = shapely.union_all(shapely.buffer(pieces, _HEAL, join_style="mitre"))
+    return wide.buffer(-_HEAL, join_style="mitre")
 
 
 def _ring(ring: Any, *, counter_clockwise: bool) -> Array:
@@ -91,22 +105,25 @@ def _between(a: Array, b: Array, *, closed: bool) -> Array | None:
     loop_a = np.vstack([a, a[:1]]) if closed else a
     loop_b = np.vstack([b, b[:1]]) if closed else b
     line_a, line_b = shapely.LineString(loop_a), shapely.LineString(loop_b)
-    entries: list[tuple[float, Array]] = []
+    stations: list[Array] = []
+    middles: list[Array] = []
     for rail, other, forward in ((a, line_b, True), (b, line_a, False)):
-        inner = range(len(rail)) if closed else range(1, len(rail) - 1)
-        for i in inner:
-            before, here, after = rail[i - 1], rail[i], rail[(i + 1) % len(rail)]
-            cross = float(np.cross(np.append(here - before, 0.0), np.append(after - here, 0.0))[2])
-            # rail b of an open band was turned round, so the region lies on its right
-            convex = cross > 0.0 if (forward or closed) else cross < 0.0
-            if not convex:
-                continue
-            point = shapely.Point(here)
-            foot = np.asarray(other.interpolate(other.project(point)).coords[0])
-            station = line_a.project(point) if forward else line_a.project(shapely.Point(foot))
-            entries.append((float(station), 0.5 * (here + foot)))
-    entries.sort(key=lambda entry: entry[0])
-    points = [entry[1] for entry in entries]
+        before, after = rail - np.roll(rail, 1, axis=0), np.roll(rail, -1, axis=0) - rail
+        cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+        # rail b of an open band was turned round, so the region lies on its right
+        convex = cross > 0.0 if (forward or closed) else cross < 0.0
+        if not closed:
+            convex[[0, -1]] = False
+        here = rail[convex]
+        place = shapely.points(here)
+        foot = shapely.get_coordinates(
+            shapely.line_interpolate_point(other, shapely.line_locate_point(other, place))
+        )
+        at = place if forward else shapely.points(foot)
+        stations.append(np.asarray(shapely.line_locate_point(line_a, at)))
+        middles.append(0.5 * (here + foot))
+    order = np.argsort(np.concatenate(stations), kind="stable")
+    points = list(np.concatenate(middles)[order])
     first, last = (points[:0], points[:1]) if closed else ([0.5 * (a[0] + b[0])], [0.5 * (a[-1] + b[-1])])
     points = [*first, *points, *last]
     line = np.array(points)

@@ -198,12 +198,10 @@ def _finish(faces: Faces, rows: Sequence[tuple[Key, Leg]]) -> list[Draft]:
     shape = classify(
         faces, stations, np.array([leg.length for leg in legs]), np.array([leg.area for leg in legs])
     )
-    spots = [_spots(leg) for leg in legs]
+    spots = _spots(legs, start, end, u, v)
     free = free_sides(
         faces,
-        np.array([spot[0] for spot in spots]),
-        np.array([spot[1] for spot in spots]),
-        np.array([spot[2] for spot in spots]),
+        *spots,
         depth + 2.0 * shape.prepared,
         stations.gap,
         np.array([key[3] for key, _ in rows]),
@@ -211,11 +209,11 @@ def _finish(faces: Faces, rows: Sequence[tuple[Key, Leg]]) -> list[Draft]:
     flip = _default_mouth(free, shape.opening, v, stations.origin)
     out = []
     for k, (key, leg) in enumerate(rows):
-        path = _path(leg, faces.origin)
-        whole = replace(leg, depth=leg.depth + float(shape.prepared[k]))
+        axes = (u[k : k + 1], v[k : k + 1]) if leg.straight else _axes(np.diff(leg.points, axis=0), leg.u)[1:]
+        path = _path(leg, faces.origin, *axes, flip=bool(flip[k]))
         sides = (bool(free[k, 0]), bool(free[k, 1]))
-        if flip[k]:
-            path, sides = path.flipped(), sides[::-1]
+        whole = replace(leg, depth=leg.depth + float(shape.prepared[k]))
+        sides = sides[::-1] if flip[k] else sides
         out.append(Draft(key[0], key[1], key[2], key[3], str(shape.kind[k]), whole, path, sides))
     return out
 
@@ -234,22 +232,27 @@ def _axes(way: Array, across: Array) -> tuple[Array, Array, Array]:
     return n, u, np.cross(n, u)
 
 
-def _spots(leg: Leg) -> tuple[Array, Array, Array]:
-    """Three points of the spine and the u and v directions there, shape (3, 3) each."""
-    way = np.diff(leg.points, axis=0)
-    _, u, v = _axes(way, leg.u)
-    if leg.straight:
-        return leg.points[0] + _SHARES[:, None] * way[0], np.repeat(u, 3, axis=0), np.repeat(v, 3, axis=0)
-    stops = np.concatenate([[0.0], np.cumsum(np.linalg.norm(way, axis=1))])
-    s = _SHARES * stops[-1]
-    i = np.clip(np.searchsorted(stops, s, side="right") - 1, 0, len(way) - 1)
-    t = (s - stops[i]) / (stops[i + 1] - stops[i])
-    return leg.points[i] + t[:, None] * way[i], u[i], v[i]
+def _spots(legs: Sequence[Leg], start: Array, end: Array, u: Array, v: Array) -> tuple[Array, Array, Array]:
+    """Three points of each spine and the u and v directions there, shape (k, 3, 3) each."""
+    points = start[:, None] + _SHARES[None, :, None] * (end - start)[:, None]
+    across, out = np.repeat(u[:, None], 3, axis=1), np.repeat(v[:, None], 3, axis=1)
+    for k, leg in enumerate(legs):
+        if leg.straight:
+            continue
+        way = np.diff(leg.points, axis=0)
+        _, leg_u, leg_v = _axes(way, leg.u)
+        stops = np.concatenate([[0.0], np.cumsum(np.linalg.norm(way, axis=1))])
+        s = _SHARES * stops[-1]
+        i = np.clip(np.searchsorted(stops, s, side="right") - 1, 0, len(way) - 1)
+        t = (s - stops[i]) / (stops[i + 1] - stops[i])
+        points[k], across[k], out[k] = leg.points[i] + t[:, None] * way[i], leg_u[i], leg_v[i]
+    return points, across, out
 
 
-def _path(leg: Leg, origin: Array) -> JointPath:
+def _path(leg: Leg, origin: Array, u: Array, v: Array, *, flip: bool) -> JointPath:
     points = leg.points + origin
-    _, u, v = _axes(np.diff(leg.points, axis=0), leg.u)
+    if flip:
+        return JointPath(points[::-1], u[::-1], -v[::-1], leg.closed)
     return JointPath(points, u, v, leg.closed)
 
 

@@ -29,7 +29,7 @@ _NEVER = (
 _STATES = ("open", "filled", "touch", "clash")
 _HIDDEN = ("sheet", "patch")
 _DIGITS = "23456789abcdefghjkmnpqrstvwxyz"
-_ID_LENGTH = 5
+_ID_LENGTH, _MOST_DIGITS = 5, 12
 _LOOSE = (0.06, 0.12, 0.25, 0.5)
 
 
@@ -263,9 +263,9 @@ def _ids(names: Sequence[str]) -> list[str]:
 
 
 def _code(name: str) -> str:
-    number = int.from_bytes(hashlib.sha256(name.encode()).digest(), "big")
+    number = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big")
     digits = []
-    for _ in range(40):
+    for _ in range(_MOST_DIGITS):
         number, digit = divmod(number, len(_DIGITS))
         digits.append(_DIGITS[digit])
     return "".join(digits)

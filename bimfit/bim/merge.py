@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -48,11 +50,22 @@ class Leg:
     closed: bool = False
     groove: bool = False
 
-    @property
+    @cached_property
     def way(self) -> Array:
         """Direction from the first point to the last."""
         d = self.points[-1] - self.points[0]
         return np.asarray(d / np.linalg.norm(d))
+
+    @cached_property
+    def middle(self) -> Array:
+        """Mean of the points."""
+        return np.asarray(self.points.mean(axis=0))
+
+    @cached_property
+    def side(self) -> Array:
+        """Out of the gap: direction of the depth on the first run."""
+        (a, b, c), (x, y, z) = self.way, self.u[0]
+        return np.array([b * z - c * y, c * x - a * z, a * y - b * x])
 
     @property
     def straight(self) -> bool:
@@ -74,21 +87,39 @@ def _with_legs(leg: Leg) -> Leg:
     return leg if leg.legs else replace(leg, legs=(leg.length,))
 
 
-def _side(leg: Leg) -> Array:
-    return np.cross(leg.way, leg.u[0])
+def _likely(
+    legs: Sequence[Leg], *, parallel: float, turn: tuple[float, float], near: bool = False
+) -> list[tuple[int, int]]:
+    """Pairs of straight legs whose axes are parallel and whose u directions have a cosine within ``turn``.
+
+    With ``near``, their sections also lie within reach of one another.
+    """
+    way = np.array([leg.way for leg in legs])
+    u = np.array([leg.u[0] for leg in legs])
+    straight = np.array([leg.straight for leg in legs])
+    cosine = u @ u.T
+    good = (np.abs(way @ way.T) >= parallel) & (cosine >= turn[0]) & (cosine <= turn[1])
+    good &= straight[:, None] & straight[None, :]
+    if near:
+        middle = np.array([leg.middle for leg in legs])
+        depth, gap = np.array([leg.depth for leg in legs]), np.abs([leg.gap for leg in legs])
+        apart = middle[None] - middle[:, None]
+        apart = apart - np.einsum("ijk,ik->ij", apart, way)[..., None] * way[:, None]
+        reach = 0.5 * (depth[:, None] + depth) + 1.5 * np.maximum(gap[:, None], gap) + 5e-3
+        good &= np.linalg.norm(apart, axis=2) <= reach + 0.01 * np.maximum(depth[:, None], depth)
+    return [(int(i), int(j)) for i, j in np.argwhere(np.triu(good, 1))]
 
 
 def _turn_facets(legs: list[Leg]) -> list[Leg]:
     """Facets of a curve that are deeper than they are long: let their axes follow the curve."""
-    plain = [i for i, leg in enumerate(legs) if leg.straight]
-    links: dict[int, list[int]] = {i: [] for i in plain}
-    for a, i in enumerate(plain):
-        for j in plain[a + 1 :]:
-            if _neighbours_across(legs[i], legs[j]):
-                links[i].append(j)
-                links[j].append(i)
+    links: dict[int, list[int]] = {i: [] for i in range(len(legs))}
+    turn = (float(np.cos(_FACET_TURN[1])), float(np.cos(_FACET_TURN[0])))
+    for i, j in _likely(legs, parallel=_STEP_PARALLEL, turn=turn, near=True):
+        if _neighbours_across(legs[i], legs[j]):
+            links[i].append(j)
+            links[j].append(i)
     seen: set[int] = set()
-    for i in plain:
+    for i in links:
         if i in seen or not links[i]:
             continue
         run, queue = [], [i]
@@ -106,7 +137,7 @@ def _turn_facets(legs: list[Leg]) -> list[Leg]:
 
 
 def _turned(leg: Leg) -> Leg:
-    middle, side = leg.points.mean(axis=0), _side(leg)
+    middle, side = leg.middle, leg.side
     points = np.stack([middle - 0.5 * leg.depth * side, middle + 0.5 * leg.depth * side])
     return replace(leg, points=points, length=leg.depth, depth=leg.length)
 
@@ -116,7 +147,7 @@ def _neighbours_across(a: Leg, b: Leg) -> bool:
     turn = float(np.arccos(np.clip(a.u[0] @ b.u[0], -1.0, 1.0)))
     if not _FACET_TURN[0] < turn < _FACET_TURN[1] or abs(a.way @ b.way) < _STEP_PARALLEL:
         return False
-    apart = b.points.mean(axis=0) - a.points.mean(axis=0)
+    apart = b.middle - a.middle
     along = abs(float(apart @ a.way))
     reach = 0.5 * (a.depth + b.depth)
     across = float(np.linalg.norm(apart - (apart @ a.way) * a.way))
@@ -129,14 +160,11 @@ def _join_collinear(legs: list[Leg]) -> list[Leg]:
     done = False
     while not done:
         done = True
-        for i in range(len(legs)):
-            for j in range(i + 1, len(legs)):
-                joined = _collinear(legs[i], legs[j])
-                if joined is not None:
-                    legs = [leg for k, leg in enumerate(legs) if k not in (i, j)] + [joined]
-                    done = False
-                    break
-            if not done:
+        for i, j in _likely(legs, parallel=_PARALLEL, turn=(_PARALLEL, 1.1)):
+            joined = _collinear(legs[i], legs[j])
+            if joined is not None:
+                legs = [leg for k, leg in enumerate(legs) if k not in (i, j)] + [joined]
+                done = False
                 break
     return legs
 
@@ -145,9 +173,9 @@ def _collinear(a: Leg, b: Leg) -> Leg | None:
     if not (a.straight and b.straight) or a.u[0] @ b.u[0] < _PARALLEL or abs(a.way @ b.way) < _PARALLEL:
         return None
     way = a.way
-    offset = b.points.mean(axis=0) - a.points.mean(axis=0)
+    offset = b.middle - a.middle
     beside = offset - (offset @ way) * way
-    if abs(beside @ a.u[0]) > _SNAP or abs(beside @ _side(a)) > 0.1 * max(a.depth, b.depth):
+    if abs(beside @ a.u[0]) > _SNAP or abs(beside @ a.side) > 0.1 * max(a.depth, b.depth):
         return None
     if abs(a.depth - b.depth) > 0.2 * max(a.depth, b.depth) or abs(a.gap - b.gap) > 2.0 * _SNAP:
         return None
@@ -172,20 +200,24 @@ def _collinear(a: Leg, b: Leg) -> Leg | None:
 def _join_steps(legs: list[Leg]) -> list[Leg]:
     """Join strips beside one another into one stepped section, led by the largest."""
     legs = sorted(legs, key=lambda leg: -leg.area)
+    beside: dict[int, set[int]] = defaultdict(set)
+    for i, j in _likely(legs, parallel=_STEP_PARALLEL, turn=(-0.2, 1.1), near=True):
+        if _steps(legs[i], legs[j]):
+            beside[i].add(j)
+            beside[j].add(i)
     out: list[Leg] = []
     taken = [False] * len(legs)
     for i, main in enumerate(legs):
         if taken[i]:
             continue
         taken[i] = True
-        group = [main]
-        grown = True
-        while grown:
-            grown = False
-            for j in range(i + 1, len(legs)):
-                if not taken[j] and any(_steps(member, legs[j]) for member in group):
-                    taken[j] = grown = True
+        group, queue = [main], [i]
+        while queue:
+            for j in sorted(beside[queue.pop()]):
+                if not taken[j]:
+                    taken[j] = True
                     group.append(legs[j])
+                    queue.append(j)
         out.append(_stepped(main, group))
     return out
 
@@ -200,7 +232,7 @@ def _steps(a: Leg, b: Leg) -> bool:
         return False
     ends = []
     for leg in (a, b):
-        middle, side = leg.points.mean(axis=0), _side(leg)
+        middle, side = leg.middle, leg.side
         ends.append(np.stack([middle - 0.5 * leg.depth * side, middle + 0.5 * leg.depth * side]))
     apart = ends[0][:, None] - ends[1][None]
     apart = apart - (apart @ way)[..., None] * way
@@ -210,10 +242,10 @@ def _steps(a: Leg, b: Leg) -> bool:
 def _stepped(main: Leg, group: Sequence[Leg]) -> Leg:
     if len(group) == 1:
         return main
-    side, spans = _side(main), []
+    side, spans = main.side, []
     for leg in group:
-        middle = float((leg.points.mean(axis=0) - main.points[0]) @ side)
-        half = 0.5 * leg.depth * abs(float(_side(leg) @ side))
+        middle = float((leg.middle - main.points[0]) @ side)
+        half = 0.5 * leg.depth * abs(float(leg.side @ side))
         spans.append((middle - half, middle + half))
     depth = max(span[1] for span in spans) - min(span[0] for span in spans)
     return replace(main, depth=max(depth, main.depth), area=sum(leg.area for leg in group))
@@ -223,15 +255,10 @@ def _join_ends(legs: list[Leg]) -> list[Leg]:
     """Join legs end to end into polylines, nearest ends first."""
     open_ = [i for i, leg in enumerate(legs) if not leg.closed]
     candidates = []
-    for a, i in enumerate(open_):
-        for j in open_[a:]:
-            for e in (0, 1):
-                for f in (0, 1):
-                    if i == j and (e, f) != (1, 0):
-                        continue
-                    distance = _end_distance(legs[i], e, legs[j], f, same=i == j)
-                    if distance is not None:
-                        candidates.append((distance, i, e, j, f))
+    for i, e, j, f in _near_ends(legs, open_):
+        distance = _end_distance(legs[i], e, legs[j], f)
+        if distance is not None:
+            candidates.append((distance, i, e, j, f))
     partner: dict[tuple[int, int], tuple[int, int]] = {}
     for _, i, e, j, f in sorted(candidates):
         if (i, e) not in partner and (j, f) not in partner:
@@ -260,10 +287,20 @@ def _reversed(leg: Leg) -> Leg:
     return replace(leg, points=leg.points[::-1].copy(), u=leg.u[::-1].copy(), legs=leg.legs[::-1])
 
 
-def _end_distance(a: Leg, e: int, b: Leg, f: int, *, same: bool) -> float | None:
+def _near_ends(legs: Sequence[Leg], open_: Sequence[int]) -> list[tuple[int, int, int, int]]:
+    """Ends of different legs near enough to be one corner: (leg, end, leg, end)."""
+    if not open_:
+        return []
+    ends = np.array([legs[i].points[-e] for i in open_ for e in (0, 1)])
+    gap = np.repeat(np.abs([legs[i].gap for i in open_]), 2)
+    apart = np.linalg.norm(ends[:, None] - ends[None], axis=2)
+    near = np.triu(apart <= 1.5 * np.maximum(gap[:, None], gap) + 0.01, 1)
+    pairs = [(int(p), int(q)) for p, q in np.argwhere(near)]
+    return [(open_[p // 2], p % 2, open_[q // 2], q % 2) for p, q in pairs if p // 2 != q // 2]
+
+
+def _end_distance(a: Leg, e: int, b: Leg, f: int) -> float | None:
     """Distance between end e of a and end f of b, where one could go on as the other."""
-    if same:
-        return None
     pa, pb = a.points[-e], b.points[-f]
     distance = float(np.linalg.norm(pa - pb))
     if distance > 1.5 * max(abs(a.gap), abs(b.gap)) + 0.01:
