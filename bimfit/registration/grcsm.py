@@ -22,7 +22,7 @@ from bimfit.registration.table import BLUR_REACH, Tables, Target
 MIN_POINTS = 3
 WEIGHT_STEPS = 255  # unequal weights are rounded to this many steps of the greatest
 ROOT_COST = 300_000.0  # look-ups that bounding the whole first level may cost
-TIME_SLICE = 20_000  # evaluations between two looks at the clock
+TIME_SLICE = 2_000  # evaluations between two looks at the clock
 NOTHING = kernels.NOTHING
 _UNIT: NDArray[np.uint64] = np.zeros(0, np.uint64)  # stands for unit weights
 lattice_of = functools.lru_cache(maxsize=64)(Lattice.of)

@@ -114,7 +114,8 @@ class Lattice:
     @cached_property
     def half_angle(self) -> Array:
         """Half a node's angle on each level, seen from its middle leaf, rad; shape (top + 1,)."""
-        return np.array((self.size[:, 2] // 2) * self.step[2], dtype=np.float64)
+        half: Array = np.multiply(self.size[:, 2] // 2, self.step[2], dtype=np.float64)
+        return half
 
     def motion(self, index: tuple[int, int, int]) -> tuple[float, float, float]:
         """The motion (u, v, theta) of a leaf."""

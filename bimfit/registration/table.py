@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -97,17 +97,32 @@ def build_tables(edges: Array, blur: float, lattice: Lattice, bound: Bound, reac
     started = time.perf_counter()
     cell = np.array(lattice.step[:2])
     leaf, origin = _leaf(edges, blur, cell, np.array(lattice.half[:2]))
-    class_of = _classes(lattice, float(cell.min()), reach)
-    majorant = _majorant_levels(lattice, blur / float(cell.max())) if bound == "majorant" else ()
+    made = tables_of_leaf(
+        leaf, origin, (blur / float(cell.min()), blur / float(cell.max())), lattice, bound, reach
+    )
+    return replace(made, seconds=time.perf_counter() - started)
+
+
+def tables_of_leaf(
+    leaf: NDArray[np.uint8],
+    origin: Array,
+    sigma: tuple[float, float],
+    lattice: Lattice,
+    bound: Bound,
+    reach: float,
+) -> Tables:
+    """Bounds of every level over any leaf table; ``sigma``: blur in cells of the finer and coarser axis."""
+    class_of = _classes(lattice, min(lattice.step[:2]), reach)
     if bound == "block":
         blocks, block_place = _printed_blocks(leaf, origin, lattice)
     else:
         blocks, block_place = _overlapped_blocks(leaf, lattice, class_of)
-    affine, affine_place = _affine(leaf, lattice, class_of, majorant, blur / float(cell.min()))
+    majorant = _majorant_levels(lattice, sigma[1]) if bound == "majorant" else ()
+    affine, affine_place = _affine(leaf, lattice, class_of, majorant, sigma[0])
     angles = lattice.angles
     return Tables(
         lattice, bound, origin, leaf, _kernels.lane_table(leaf), blocks, block_place, affine, affine_place,
-        class_of, reach, np.cos(angles), np.sin(angles), time.perf_counter() - started,
+        class_of, reach, np.cos(angles), np.sin(angles), 0.0,
     )  # fmt: skip
 
 
@@ -193,7 +208,7 @@ def _printed_blocks(
 ) -> tuple[NDArray[np.uint8], Integers]:
     """Block maxima of s^h cells, aligned with the window (Eq. 3 to 5); level 0 is the leaf table."""
     height, width = leaf.shape
-    shift = np.rint((origin + np.array(lattice.half[:2])) / np.array(lattice.step[:2])).astype(np.int64)
+    shift = aligned(origin, lattice)
     place = np.zeros((lattice.top + 1, 5), np.int64)
     parts: list[NDArray[np.uint8]] = []
     offset = 0
@@ -210,6 +225,12 @@ def _printed_blocks(
         parts.append(out.ravel())
         offset += out.size
     return np.concatenate(parts), place
+
+
+def aligned(origin: Array, lattice: Lattice) -> Integers:
+    """Cell (u, v) of a table's corner, counted from the window's low corner, where printed blocks begin."""
+    cells = (origin + np.array(lattice.half[:2])) / np.array(lattice.step[:2])
+    return np.asarray(np.rint(cells), np.int64)
 
 
 def _affine(

@@ -43,8 +43,12 @@ def ranges(profiles, origin, directions):
     return out
 
 
-def make_slice(rng, *, common=(0.02, 0.02, math.radians(5)), each=(0.006, 0.006, math.radians(3)), sigma=0.003,
-               beams=171, half=85 * math.radians(0.352)):  # fmt: skip
+TURN, TURN_EACH, HALF = math.radians(5), math.radians(3), 85 * math.radians(0.352)
+
+
+def make_slice(
+    rng, *, common=(0.02, 0.02, TURN), each=(0.006, 0.006, TURN_EACH), sigma=0.003, beams=171, half=HALF
+):
     """One slice: (Slice, common pose, (pose A, pose B))."""
     lift = lambda scale: [float(x) for x in rng.uniform(-1.0, 1.0, 3) * scale]  # noqa: E731
     whole = Pose2D.about((0.0, 0.0), *lift(np.array(common)))

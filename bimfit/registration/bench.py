@@ -1,0 +1,199 @@
+"""The matcher suite: time, evaluations and failures of every matcher on the same slices, one thread."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from bimfit.config import SearchConfig
+from bimfit.geometry.pose import Array, Pose2D
+from bimfit.geometry.slice import Slice
+from bimfit.registration.matchers import MATCHERS, match
+from bimfit.registration.result import MatchResult
+from bimfit.registration.table import Tables, Target
+
+Job = tuple[Target, Slice, Pose2D]
+SAME = 1e-9  # scores closer than this are equal
+
+
+@dataclass(frozen=True)
+class BenchRow:
+    """One line of the published table.
+
+    Attributes
+    ----------
+    suite, name : str
+        What was measured.
+    slices : int
+        Over how many matches.
+    median_ms, p95_ms : float
+        Wall time of a match, all of it but building tables.
+    evaluations : float
+        Median number of bounds and scores.
+    proven : float
+        Share of matches with a proven optimum.
+    missed : float
+        Share whose score is under that of the proven search; NaN where there is nothing to compare.
+    off_10mm : float
+        Share more than 10 mm from the truth; NaN where no truth is known.
+    """
+
+    suite: str
+    name: str
+    slices: int
+    median_ms: float
+    p95_ms: float
+    evaluations: float = float("nan")
+    proven: float = float("nan")
+    missed: float = float("nan")
+    off_10mm: float = float("nan")
+
+
+def time_matches(name: str, jobs: Sequence[Job], config: SearchConfig) -> tuple[list[MatchResult], Array]:
+    """Run one matcher over jobs: results and wall times (s). A match before, not counted, builds the tables."""
+    method = MATCHERS[name]
+    for first in {id(job[0]): job for job in jobs}.values():
+        method(*first, config)
+    results, seconds = [], []
+    for target, slice_, prior in jobs:
+        started = time.perf_counter()
+        results.append(method(target, slice_, prior, config))
+        seconds.append(time.perf_counter() - started)
+    return results, np.array(seconds)
+
+
+def bench_methods(
+    target: Target,
+    slices: Sequence[Slice],
+    config: SearchConfig,
+    methods: Sequence[str] = ("grcsm", "overlap", "mrcsm", "block", "icp-point", "icp-plane", "brute"),
+    *,
+    starts: Sequence[Pose2D] | None = None,
+    truth: Sequence[Pose2D] | None = None,
+    most: dict[str, int] | None = None,
+) -> list[BenchRow]:
+    """Every method over the same slices.
+
+    Parameters
+    ----------
+    target : Target
+    slices : sequence of Slice
+    config : SearchConfig
+    methods : sequence of str
+        Names in ``MATCHERS``; ``grcsm`` is what the others' misses are counted against.
+    starts : sequence of Pose2D, optional
+        Where ICP starts, one a slice (the search's prior is the designed pose); default: the designed pose.
+    truth : sequence of Pose2D, optional
+        As-built poses of the model, compared at the section's origin.
+    most : dict of str to int, optional
+        Fewer slices for slow methods, such as ``{"brute": 5}``.
+    """
+    rows = []
+    reference: list[MatchResult] | None = None
+    for name in methods:
+        count = min(len(slices), (most or {}).get(name, len(slices)))
+        from_start = starts is not None and "icp" in name
+        priors = list(starts)[:count] if from_start and starts is not None else [Pose2D()] * count
+        jobs = [(target, s, p) for s, p in zip(slices[:count], priors, strict=True)]
+        results, seconds = time_matches(name, jobs, config)
+        if name == "grcsm":
+            reference = results
+        missed = float("nan")
+        if reference is not None and name in ("grcsm", "overlap", "block", "brute"):
+            pairs = zip(results, reference[:count], strict=True)
+            missed = float(np.mean([r.score < best.score - SAME for r, best in pairs]))
+        rows.append(_row("matcher", name, results, seconds, missed, truth))
+    return rows
+
+
+def bench_growth(
+    target: Target,
+    slices: Sequence[Slice],
+    config: SearchConfig,
+    *,
+    windows: Sequence[float] = (0.03, 0.1215, 0.243),
+    angles: Sequence[float] = (0.1047, 0.7854, 3.1416),
+    tolerances: Sequence[float] = (0.001, 0.0005, 0.00025),
+    points: Sequence[int] = (50, 171, 500, 2000),
+    seed: int = 0,
+) -> list[BenchRow]:
+    """How the proven search grows with the window, the angle, the tolerance and the number of points.
+
+    Points are resampled from each slice with replacement, with half a millimetre of seeded noise.
+    """
+    w, t = config.window, config.tolerance
+    cases = [(f"window +-{x * 1e3:g} mm", dataclasses.replace(config, window=(x, x, w[2]))) for x in windows]
+    cases += [
+        (f"angle +-{np.degrees(x):.0f} deg", dataclasses.replace(config, window=(*w[:2], min(x, np.pi))))
+        for x in angles
+    ]
+    cases += [
+        (f"tolerance {x * 1e3:g} mm", dataclasses.replace(config, tolerance=(x, x, t[2]))) for x in tolerances
+    ]
+    rows = [_growth_row(name, target, slices, setting) for name, setting in cases]
+    rng = np.random.default_rng(seed)
+    for count in points:
+        many = []
+        for s in slices:
+            drawn = s.points[np.sort(rng.integers(0, len(s.points), count))]
+            many.append(dataclasses.replace(s, points=drawn + rng.normal(0.0, 5e-4, drawn.shape), beams=None))
+        rows.append(_growth_row(f"{count} points", target, many, config))
+    return rows
+
+
+def bench_threads(target: Target, slices: Sequence[Slice], config: SearchConfig, threads: int = 2) -> float:
+    """How many times faster a pool of threads goes through the slices than one thread does."""
+    match(target, slices[0], Pose2D(), config)
+
+    def run(workers: int) -> float:
+        with ThreadPoolExecutor(workers) as pool:
+            list(pool.map(lambda s: match(target, s, Pose2D(), config), slices[: 4 * workers]))
+            started = time.perf_counter()
+            list(pool.map(lambda s: match(target, s, Pose2D(), config), slices, chunksize=8))
+            return time.perf_counter() - started
+
+    alone, together = min(run(1) for _ in range(3)), min(run(threads) for _ in range(3))
+    return alone / together
+
+
+def table_figures(target: Target) -> list[dict[str, object]]:
+    """Memory and building time of every set of tables that a target holds."""
+    return [
+        {
+            "bound": t.bound, "levels": t.lattice.levels, "tests": t.lattice.tests,
+            "cells": t.leaf.shape, "mebibytes": t.nbytes / 2**20, "build_seconds": t.seconds,
+        }
+        for t in target.kept.values() if isinstance(t, Tables)
+    ]  # fmt: skip
+
+
+def _growth_row(name: str, target: Target, slices: Sequence[Slice], config: SearchConfig) -> BenchRow:
+    results, seconds = time_matches("grcsm", [(target, s, Pose2D()) for s in slices], config)
+    return _row("growth", name, results, seconds, float("nan"), None)
+
+
+def _row(
+    suite: str,
+    name: str,
+    results: Sequence[MatchResult],
+    seconds: Array,
+    missed: float,
+    truth: Sequence[Pose2D] | None,
+) -> BenchRow:
+    off = float("nan")
+    if truth is not None:
+        errors = [
+            np.hypot(r.parameters[0] - p.u, r.parameters[1] - p.v) if r.found else np.inf
+            for r, p in zip(results, truth[: len(results)], strict=True)
+        ]
+        off = float(np.mean(np.array(errors) > 0.01))
+    return BenchRow(
+        suite, name, len(results), float(np.median(seconds) * 1e3), float(np.percentile(seconds, 95) * 1e3),
+        float(np.median([r.evaluations for r in results])),
+        float(np.mean([r.stop == "proven" for r in results])), missed, off,
+    )  # fmt: skip

@@ -1,0 +1,214 @@
+"""Bounds are bounds: over random tables, points and weights, on every level."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, seed, settings
+from hypothesis import strategies as st
+
+from bimfit.config import SearchConfig
+from bimfit.registration import _kernels as kernels
+from bimfit.registration import grcsm, table
+from bimfit.registration.lattice import Lattice
+from bimfit.registration.printed import run_brute, run_printed
+
+QUICK = settings(max_examples=40, deadline=None, derandomize=True)
+
+
+def random_leaf(rng, kind, height, width):
+    """Noise, a smooth ridge, or a few spikes: what a majorant finds hard differs."""
+    if kind == 0:
+        return rng.integers(0, 256, (height, width)).astype(np.uint8)
+    if kind == 1:
+        y, x = np.mgrid[:height, :width]
+        a, b = rng.uniform(-0.5, 0.5, 2)
+        d = a * x + y - b * width - 0.5 * height
+        return np.rint(255 * np.exp(-0.5 * (d / rng.uniform(1.0, 5.0)) ** 2)).astype(np.uint8)
+    out = np.zeros((height, width), np.uint8)
+    for _ in range(4):
+        out[rng.integers(height), rng.integers(width)] = rng.integers(1, 256)
+    return out
+
+
+def random_problem(seed_, tests, levels, kind, bound, weighted):
+    rng = np.random.default_rng(seed_)
+    half = tuple(float(0.5 * s**n) for s, n in zip(tests[:2], levels[:2], strict=True))  # cells of 1
+    half_angle = float(rng.uniform(0.05, math.pi)) if rng.random() < 0.8 else math.pi
+    lattice = Lattice((*half, half_angle), (1.0, 1.0, 2 * half_angle / tests[2] ** levels[2]), tests, levels)
+    leaf = random_leaf(rng, kind, int(rng.integers(3, 40)), int(rng.integers(3, 60)))
+    n = int(rng.integers(3, 25))
+    points = rng.normal(0.0, 1.0, (n, 2)) * rng.uniform(1.0, 25.0)
+    reach = float(np.hypot(*points.T).max())
+    sigma = float(rng.uniform(0.5, 12.0))
+    made = table.tables_of_leaf(leaf, -np.array(half), (sigma, sigma), lattice, bound, reach)
+    weight = (rng.integers(0, 256, n) if weighted else np.ones(n)).astype(np.uint64)
+    start = np.array([*rng.uniform(-10, 60, 2), 1.0, 1.0, 0.0])
+    return grcsm.Problem(
+        made, np.zeros(2), points[:, 0].copy(), points[:, 1].copy(), weight, 1 / 255, start, 0.0
+    )
+
+
+def naive_scores(problem):
+    """Every leaf's score with NumPy alone, shape (theta, v, u)."""
+    tables, lattice = problem.tables, problem.tables.lattice
+    nu, nv, nt = lattice.count
+    leaf = tables.leaf.astype(np.int64)
+    out = np.zeros((nt, nv, nu), np.int64)
+    for t, angle in enumerate(lattice.angles):
+        c, s = math.cos(angle), math.sin(angle)
+        x = np.floor(c * problem.pu - s * problem.pv + problem.start[0]).astype(int)
+        y = np.floor(s * problem.pu + c * problem.pv + problem.start[1]).astype(int)
+        for v in range(nv):
+            for u in range(nu):
+                i, j = y + v, x + u
+                inside = (i >= 0) & (i < leaf.shape[0]) & (j >= 0) & (j < leaf.shape[1])
+                w = problem.weight[inside].astype(np.int64)
+                out[t, v, u] = (w * leaf[i[inside], j[inside]]).sum()
+    return out
+
+
+SHAPES = st.tuples(st.integers(2, 5), st.integers(2, 5), st.integers(2, 5)).flatmap(
+    lambda s: st.tuples(st.just(s), st.tuples(*[st.integers(0, 3 if a == 2 else 2) for a in s]))
+)
+
+
+@pytest.mark.parametrize("bound", ["majorant", "overlap"])
+@seed(3)
+@QUICK
+@given(st.integers(0, 2**32 - 1), SHAPES, st.integers(0, 2), st.booleans())
+def test_the_search_equals_a_naive_maximum(bound, seed_, shape, kind, weighted):
+    problem = random_problem(seed_, *shape, kind, bound, weighted)
+    scores = naive_scores(problem)
+    best = np.unravel_index(np.argmax(scores), scores.shape)  # the first of the best in (theta, v, u)
+    found = grcsm.run(problem, SearchConfig())
+    assert found.score == scores[best]
+    assert found.index == (best[2], best[1], best[0])
+    assert found.stop == "proven" and found.bound == found.score
+    brute = run_brute(problem, SearchConfig())
+    assert (brute.score, brute.index) == (found.score, found.index)
+
+
+@seed(4)
+@QUICK
+@given(st.integers(0, 2**32 - 1), SHAPES, st.integers(0, 2), st.booleans())
+def test_no_node_holds_a_leaf_above_its_bound(seed_, shape, kind, weighted):
+    """Block bounds of every node of every level, from the tables and slack classes the search reads."""
+    problem = random_problem(seed_, *shape, kind, "overlap", weighted)
+    tables, lattice, n = problem.tables, problem.tables.lattice, problem.n
+    scores = naive_scores(problem)
+    classes = np.empty((lattice.top + 1) * n, np.uint8)
+    kernels.point_classes(n, problem.pu, problem.pv, 1.0, 1.0, lattice.half_angle, tables.class_of, classes)
+    for level in range(1, lattice.top + 1):
+        bu, bv, bt = (int(x) for x in lattice.size[level])
+        nu, nv, nt = (int(x) for x in lattice.nodes[level])
+        most = scores.reshape(nt, bt, nv, bv, nu, bu).max(axis=(1, 3, 5))
+        for t in range(nt):
+            cu, cv, at = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(2 * n, np.int32)
+            angle = t * bt + bt // 2
+            kernels.fill_cells(
+                tables.cosine[angle], tables.sine[angle], problem.pu, problem.pv, problem.start, cu, cv
+            )
+            lists, counts, out = (
+                np.empty((4, n), np.int32),
+                np.empty(1, np.int32),
+                np.empty(nv * nu, np.int64),
+            )
+            own = classes[level * n : level * n + n]
+            kernels.merge_blocks(cu, cv, problem.weight, own, bu, bv, at, lists, counts, 0)
+            kernels.bound_box(
+                0, n, lists, counts, tables.blocks, tables.block_place[level], 0, nv, 0, nu, out
+            )
+            assert np.all(out.reshape(nv, nu) >= most[t])
+
+
+@seed(5)
+@QUICK
+@given(st.integers(0, 2**32 - 1), st.integers(0, 2), st.integers(0, 4), st.integers(0, 4), st.integers(0, 4))
+def test_a_majorant_lies_above_its_window(seed_, kind, ru, rv, shift):
+    rng = np.random.default_rng(seed_)
+    leaf = random_leaf(rng, kind, int(rng.integers(1, 20)), int(rng.integers(1, 20)))
+    pad = max(ru, rv) + 1
+    out = np.empty((leaf.shape[0] + 2 * pad, leaf.shape[1] + 2 * pad), np.uint32)
+    kernels.affine_table(leaf, ru, rv, pad, shift, out)
+    a, gu, gv = (
+        (out & 65535).astype(int),
+        ((out >> 16) & 255).astype(int) - 128,
+        (out >> 24).astype(int) - 128,
+    )
+    wide = np.pad(leaf.astype(int), pad + max(ru, rv))
+    rows, columns = out.shape
+    edge = max(ru, rv)
+    for dv in range(-rv, rv + 1):
+        for du in range(-ru, ru + 1):
+            moved = wide[edge + dv : edge + dv + rows, edge + du : edge + du + columns]
+            assert np.all(moved << shift <= a + gu * du + gv * dv)
+    rim = np.concatenate([out[0], out[-1], out[:, 0], out[:, -1]])
+    assert np.all(rim == (128 << 16) | (128 << 24))  # what lies outside counts nothing
+
+
+@seed(6)
+@QUICK
+@given(st.integers(0, 2**32 - 1), SHAPES, st.integers(0, 2), st.floats(0.0, 0.5))
+def test_collecting_finds_every_leaf_within_delta(seed_, shape, kind, delta):
+    problem = random_problem(seed_, *shape, kind, "majorant", False)
+    scores = naive_scores(problem)
+    floor = max(1, math.ceil(scores.max() * (1.0 - delta)))
+    codes, values = grcsm.run(problem, SearchConfig(), collect_from=floor).found
+    t, v, u = np.nonzero(scores >= floor)
+    expected = (t.astype(np.int64) << 40) | (v.astype(np.int64) << 20) | u
+    order = np.argsort(codes)
+    assert np.array_equal(codes[order], np.sort(expected))
+    assert np.array_equal(values[order], scores[scores >= floor])
+
+
+@seed(7)
+@QUICK
+@given(st.integers(0, 2**32 - 1), SHAPES, st.tuples(*[st.floats(0.05, 20.0)] * 3))
+def test_a_prior_is_added_exactly(seed_, shape, sigma):
+    problem = random_problem(seed_, *shape, 1, "majorant", False)
+    lattice = problem.tables.lattice
+    config = SearchConfig(prior_sigma=sigma, prior_weight=0.7)
+    total = naive_scores(problem)
+    for axis, where in ((0, 2), (1, 1), (2, 0)):
+        motion = lattice.first[axis] + lattice.step[axis] * np.arange(lattice.count[axis])
+        steps = np.rint(-0.5 * 0.7 * 255 * (motion / sigma[axis]) ** 2).astype(np.int64)
+        total = total + np.expand_dims(steps, tuple(a for a in range(3) if a != where))
+    best = np.unravel_index(np.argmax(total), total.shape)
+    found = grcsm.run(problem, config)
+    assert found.score == total[best]
+    assert found.index == (best[2], best[1], best[0])
+
+
+@seed(8)
+@QUICK
+@given(st.integers(0, 2**32 - 1), SHAPES, st.integers(1, 400), st.integers(0, 2))
+def test_a_budget_leaves_a_true_bound(seed_, shape, limit, kind):
+    problem = random_problem(seed_, *shape, kind, "majorant", False)
+    most = int(naive_scores(problem).max())
+    found = grcsm.run(problem, SearchConfig(max_evaluations=limit))
+    assert found.score <= most <= found.bound
+    if found.stop == "proven":
+        assert found.score == most
+
+
+def test_a_lattice_follows_the_paper():
+    lattice = Lattice.of(SearchConfig())
+    assert lattice.levels == (5, 5, 5) and lattice.count == (243, 243, 243)
+    assert lattice.step[0] == pytest.approx(0.001)
+    assert lattice.motion((121, 121, 121)) == pytest.approx((0.0, 0.0, 0.0), abs=1e-15)
+    two = Lattice.of(dataclasses.replace(SearchConfig(), levels=2))
+    assert two.levels == (2, 2, 2) and two.tests == (16, 16, 13)
+
+
+@seed(9)
+@QUICK
+@given(st.integers(0, 2**32 - 1), SHAPES, st.integers(0, 2))
+def test_the_printed_search_scores_the_leaf_it_returns(seed_, shape, kind):
+    """It may miss the best leaf, but what it reports is that leaf's score, and never more than the best."""
+    problem = random_problem(seed_, *shape, kind, "block", False)
+    scores = naive_scores(problem)
+    found = run_printed(problem, SearchConfig())
+    u, v, t = found.index
+    assert found.score == scores[t, v, u] <= scores.max()
