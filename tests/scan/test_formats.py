@@ -149,6 +149,36 @@ def test_lzf_undoes_what_it_says():
     assert lzf_decompress(bytes([2, 97]), 3) is None
 
 
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+def test_las_by_laspy(tmp_path, cloud, suffix):
+    laspy = pytest.importorskip("laspy")
+    header = laspy.LasHeader(point_format=3, version="1.2")
+    header.scales, header.offsets = np.full(3, 1e-4), np.floor(cloud.points.min(axis=0))
+    out = laspy.LasData(header)
+    out.x, out.y, out.z = cloud.points.T
+    out.intensity = np.arange(len(cloud))
+    file = tmp_path / f"c.{suffix}"
+    out.write(file)
+    back = read_scan(file)
+    # half a step of the file's own scale, 0.1 mm
+    assert np.allclose(back.points, cloud.points, rtol=0, atol=0.51e-4)
+    assert np.array_equal(back.intensity, np.arange(len(cloud)))
+    data = file.read_bytes()
+    for share in (0.01, 0.3, 0.9):
+        file.write_bytes(data[: int(share * len(data))])
+        with pytest.raises(ScanError):
+            read_scan(file)
+
+
+def test_las_without_laspy_names_the_extra(tmp_path, monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "laspy", None)
+    (tmp_path / "c.las").write_bytes(b"LASF" + bytes(400))
+    with pytest.raises(ScanError, match=r"bimfit\[las\]"):
+        read_scan(tmp_path / "c.las")
+
+
 # -- organised clouds --------------------------------------------------------------------------------
 
 

@@ -13,6 +13,7 @@ from bimfit.files import whole_file
 from bimfit.geometry.line_scan import LineScan
 from bimfit.scan.cloud import PointCloud
 from bimfit.scan.formats.delimited import read_csv, write_csv
+from bimfit.scan.formats.las import read_las
 from bimfit.scan.formats.npz import read_npz, write_npz
 from bimfit.scan.formats.pcd import read_pcd, write_pcd
 from bimfit.scan.formats.ply import read_ply, write_ply
@@ -54,6 +55,7 @@ FORMATS: tuple[Format, ...] = (
     Format("NPZ", (".npz",), read_npz, write_npz, (b"PK\x03\x04",), beams=True),
     Format("PLY", (".ply",), read_ply, write_ply, (b"ply\n", b"ply\r\n")),
     Format("PCD", (".pcd",), read_pcd, write_pcd, (b"# .PCD", b"VERSION 0.7", b"VERSION .7")),
+    Format("LAS", (".las", ".laz"), read_las, None, (b"LASF",)),
     Format("XYZ", (".xyz", ".txt", ".pts", ".asc"), read_xyz, write_xyz),
 )
 

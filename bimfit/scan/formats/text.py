@@ -14,6 +14,7 @@ import numpy as np
 
 from bimfit.errors import ScanError
 from bimfit.geometry.pose import Array
+from bimfit.scan.formats.decimals import parse_columns
 
 CHUNK = 1 << 25
 """Bytes of text parsed at a time: what bounds the memory beyond the numbers themselves."""
@@ -133,13 +134,11 @@ def _quick(block: bytes, delimiter: str, width: int, wanted: list[int]) -> Array
     if b'"' in block:
         return None
     if delimiter != " ":
-        if not _even(block, ord(delimiter), width):
+        if b"_" in block:  # which float() takes for part of a number
             return None
-        mark = delimiter.encode()
-        block = block.replace(mark + b"\n", mark + b"nan\n")
-        if mark + mark in block:
-            for _ in range(2):
-                block = block.replace(mark + mark, mark + b"nan" + mark)
+        if b"\n\n" in block or block.startswith(b"\n"):
+            block = b"\n".join(line for line in block.split(b"\n") if line) + b"\n"
+        return parse_columns(block, ord(delimiter), width, wanted)
     try:
         text = block.decode("ascii")
         with warnings.catch_warnings():
@@ -157,16 +156,6 @@ def _quick(block: bytes, delimiter: str, width: int, wanted: list[int]) -> Array
         # without usecols loadtxt itself insists that all rows are of one length
         return np.asarray(out[:, wanted]) if out.shape[1] == width else None
     return np.asarray(out.reshape(-1, len(wanted)))
-
-
-def _even(block: bytes, mark: int, width: int) -> bool:
-    """Whether every line that is not blank has ``width`` cells."""
-    data = np.frombuffer(block, np.uint8)
-    ends = np.flatnonzero(data == 10)
-    before = np.searchsorted(np.flatnonzero(data == mark), ends)
-    count = np.diff(before, prepend=0)
-    blank = np.diff(ends, prepend=-1) == 1
-    return bool(np.all((count == width - 1) | blank))
 
 
 def _slow(
