@@ -290,3 +290,18 @@ def test_memory_is_kept_to_by_a_coarser_lattice() -> None:
     assert small.nbytes < 4.4 * 2**20
     truth = about([0.08, 0.045, 0.05], [0.01, -0.015, 0.004], [0.01, 0.02, -0.02])
     assert error(T_scan_model(match_3d(small, cloud(3, 300, truth))), truth)[0] < 0.0015
+
+
+def test_bench_gives_a_row_a_method() -> None:
+    from bimfit.registration.bench_3d import bench_matcher_3d, gap_scene
+
+    scene = gap_scene()
+    assert scene.volume == pytest.approx(2 * 0.2 * 0.025 * 0.5)
+    window = (0.004, 0.005)
+    rows = bench_matcher_3d(1, (window,), points=300, methods=("grcsm-3d", "icp-plane", "g-icp"))
+    names = [row.method for row in rows]
+    assert names[:2] == ["grcsm-3d", "icp-plane"]
+    assert rows[0].failures == 0
+    assert rows[0].proven == 1
+    assert rows[0].mean_mm < 5.0
+    assert all(row.starts == 1 and row.median_ms > 0.0 for row in rows)
