@@ -6,8 +6,9 @@ Beams come sorted by pseudo-angle within groups of one origin each, as arrays:
 ``d``      (2, n) unit directions;  ``r`` (n,) ranges, negative where nothing came back
 ``start``  (g + 1,) first beam of every group;  ``eye`` (g, 4) origin and look direction of every group
 
-``off`` (n,) is added to the log-likelihood whenever the beam is predicted to meet the component, and
-``lim`` (n,) is the range at which something else is in the way. No ``fastmath``: misses rely on inf.
+``off`` (n,) is added to the log-likelihood whenever the beam is predicted to meet the component, ``deep``
+(n,) besides when its return lies more than ``margin`` behind the component, and ``lim`` (n,) is the range
+at which something else is in the way. No ``fastmath``: misses rely on inf.
 """
 
 from __future__ import annotations
@@ -170,6 +171,8 @@ def log_likelihood(
     start: Ints,
     eye: Array,
     off: Array,
+    deep: Array,
+    margin: float,
     lim: Array,
     sigma: float,
     spread: float,
@@ -189,7 +192,7 @@ def log_likelihood(
         face[k] = -1
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     predict(edges, cos, sin, pose[0], pose[1], p, d, start, eye, rho, face)
-    total: float = _total(edges, cos, sin, d, r, off, sigma, spread, table, scale, rho, face)
+    total: float = _total(edges, cos, sin, d, r, off, deep, margin, sigma, spread, table, scale, rho, face)
     return total
 
 
@@ -201,6 +204,8 @@ def _total(
     d: Array,
     r: Array,
     off: Array,
+    deep: Array,
+    margin: float,
     sigma: float,
     spread: float,
     table: Array,
@@ -231,6 +236,8 @@ def _total(
             s2 = 1.0 + spread * rho[k] * rho[k] * (rho[k] * rho[k] / c2 - 1.0)
             x = x / s2 + math.log(s2) / scale
         total += logs[int(min(x, last) + 0.5)] + off[k]
+        if z > margin:
+            total += deep[k]
     return total
 
 
@@ -347,6 +354,8 @@ def slide(
     start: Ints,
     eye: Array,
     off: Array,
+    deep: Array,
+    margin: float,
     sigma: float,
     table: Array,
     scale: float,
@@ -369,10 +378,14 @@ def slide(
         predict(edges_b, cos, sin, tx, ty, p, d, start, eye, rho, face)
         total = -0.5 * (steps[i, 0] ** 2 + steps[i, 1] ** 2) / (prior * prior)
         for k in range(n):
+            if face[k] < 0:
+                continue
             e = r[k] - rho[k]
-            x = min(e * e * unit, last) if face[k] >= 0 else last
+            x = min(e * e * unit, last)
             total += logs[int(x + 0.5)]
-            total += off[k] if face[k] >= 0 else 0.0
+            total += off[k]
+            if e > margin:
+                total += deep[k]
         scores[i] = total
 
 
@@ -400,6 +413,8 @@ def posterior(
     start: Ints,
     eye: Array,
     off: Array,
+    deep: Array,
+    margin: float,
     lim: Array,
     sigma: float,
     spread: float,
@@ -445,7 +460,7 @@ def posterior(
     face = np.empty(n, np.int64)
     H, g, pose = np.empty((3, 3)), np.empty(3), np.empty(3)
     pinv = np.array([1.0 / prior[0] ** 2, 1.0 / prior[1] ** 2, 1.0 / (prior[2] * rs) ** 2])
-    args = (edges, rs, p, d, r, start, eye, off, lim, sigma, spread, table, scale, prior, pinv)
+    args = (edges, rs, p, d, r, start, eye, off, deep, margin, lim, sigma, spread, table, scale, prior, pinv)
     q = np.array([begin[0], begin[1], begin[2] * rs])
     _pilot(args, q, rho, face, H, g, pose)
     nodes = 25
@@ -516,7 +531,7 @@ def posterior(
     info[5] = math.sqrt(max(_along(cov, axes), 0.0))
     pose[0], pose[1], pose[2] = mean[0], mean[1], mean[2] / rs
     info[8] = log_likelihood(
-        edges, pose, p, d, r, start, eye, off, lim, sigma, spread, table, scale, rho, face
+        edges, pose, p, d, r, start, eye, off, deep, margin, lim, sigma, spread, table, scale, rho, face
     )
 
 
@@ -533,13 +548,13 @@ def _along(m: Array, axes: Array) -> float:
 @njit(**_JIT)
 def _pilot(args: tuple[Any, ...], q: Array, rho: Array, face: Ints, H: Array, g: Array, pose: Array) -> None:
     """Six annealed Gauss-Newton steps from q; q becomes the best place passed."""
-    edges, rs, p, d, r, start, eye, off, lim, sigma, spread, table, scale, prior, pinv = args
+    edges, rs, p, d, r, start, eye, off, deep, margin, lim, sigma, spread, table, scale, prior, pinv = args
     x, at = np.empty(3), q.copy()
     top = -np.inf
     for it in range(7):
         pose[0], pose[1], pose[2] = at[0], at[1], at[2] / rs
         value = log_likelihood(
-            edges, pose, p, d, r, start, eye, off, lim, sigma, spread, table, scale, rho, face
+            edges, pose, p, d, r, start, eye, off, deep, margin, lim, sigma, spread, table, scale, rho, face
         ) + _log_prior(pose, prior)
         if value > top:
             top = value
@@ -564,7 +579,7 @@ def _profile(
     best: Array,
 ) -> float:  # fmt: skip
     """Log marginal along the weak direction, from the middle node outwards; returns its maximum."""
-    edges, rs, p, d, r, start, eye, off, lim, sigma, spread, table, scale, prior, _ = args
+    edges, rs, p, d, r, start, eye, off, deep, margin, lim, sigma, spread, table, scale, prior, _ = args
     H, g, pose, L = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((2, 2))
     nodes = best.shape[0]
     mid = nodes // 2
@@ -579,7 +594,7 @@ def _profile(
             _conditional_step(args, q, axes, (i - mid) * step, w[i], P2, rho, face, H, g, pose, L)
         _pose_at(q, axes, (i - mid) * step, w[i, 0], w[i, 1], rs, pose)
         value = log_likelihood(
-            edges, pose, p, d, r, start, eye, off, lim, sigma, spread, table, scale, rho, face
+            edges, pose, p, d, r, start, eye, off, deep, margin, lim, sigma, spread, table, scale, rho, face
         )
         best[i] = value + _log_prior(pose, prior) - math.log(L[0, 0] * L[1, 1])
     return float(best.max())
@@ -615,7 +630,7 @@ def _conditional_step(
     L: Array,
 ) -> None:
     """One Gauss-Newton step of w at fixed s; L becomes the Cholesky factor of its information."""
-    edges, rs, p, d, r, start, eye, _, lim, sigma, spread, table, scale, _, pinv = args
+    edges, rs, p, d, r, start, eye, _, _, _, lim, sigma, spread, table, scale, _, pinv = args
     _pose_at(q, axes, s, w[0], w[1], rs, pose)
     normal_equations(
         edges, pose, rs, p, d, r, start, eye, lim, sigma, 0.0, 2, spread, table, scale, rho, face, H, g
@@ -662,7 +677,7 @@ def _integrate(
     info: Array,
 ) -> None:
     """Moments by midpoints along u and Gauss-Hermite across (METHOD, section 4, step 8)."""
-    edges, rs, p, d, r, start, eye, off, lim, sigma, spread, table, scale, prior, _ = args
+    edges, rs, p, d, r, start, eye, off, deep, margin, lim, sigma, spread, table, scale, prior, _ = args
     if mixed:
         xs = np.array([0.0, 1.3556261799742659, -1.3556261799742659, 2.8569700138728056, -2.8569700138728056])
         lw = np.log(
@@ -706,7 +721,23 @@ def _integrate(
                     y0 = (xs[a] - L[1, 0] * y1) / L[0, 0]
                     _pose_at(q, axes, s, wc[0] + y0, wc[1] + y1, rs, pose)
                     value = log_likelihood(
-                        edges, pose, p, d, r, start, eye, off, lim, sigma, spread, table, scale, rho, face
+                        edges,
+                        pose,
+                        p,
+                        d,
+                        r,
+                        start,
+                        eye,
+                        off,
+                        deep,
+                        margin,
+                        lim,
+                        sigma,
+                        spread,
+                        table,
+                        scale,
+                        rho,
+                        face,
                     ) + _log_prior(pose, prior)
                     mode = max(mode, value)
                     values[count] = value + 0.5 * (xs[a] * xs[a] + xs[b] * xs[b]) + lw[a] + lw[b] + base
@@ -801,7 +832,7 @@ def _sample(
     Returns that graze a deep face, or two visible ends, can pin a component to a sliver that lies askew
     to the weak direction. The likelihood is raised to a power that grows to 1 as the proposal adapts.
     """
-    edges, rs, p, d, r, start, eye, off, lim, sigma, spread, table, scale, prior, _ = args
+    edges, rs, p, d, r, start, eye, off, deep, margin, lim, sigma, spread, table, scale, prior, _ = args
     n = draws.shape[0]
     rho = np.empty(p.shape[0])
     face = np.empty(p.shape[0], np.int64)
@@ -820,7 +851,23 @@ def _sample(
                     x[i, a] += L[a, b] * draws[i, b]
             pose[0], pose[1], pose[2] = x[i, 0], x[i, 1], x[i, 2] / rs
             target[i] = log_likelihood(
-                edges, pose, p, d, r, start, eye, off, lim, sigma, spread, table, scale, rho, face
+                edges,
+                pose,
+                p,
+                d,
+                r,
+                start,
+                eye,
+                off,
+                deep,
+                margin,
+                lim,
+                sigma,
+                spread,
+                table,
+                scale,
+                rho,
+                face,
             )
             before[i] = _log_prior(pose, prior)
         low, power = power, 1.0

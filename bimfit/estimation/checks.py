@@ -18,6 +18,7 @@ from bimfit.geometry.pose import Array, Pose2D
 from bimfit.geometry.status import OK, Status
 
 Mask = NDArray[np.bool_]
+_RIVAL_ODDS = -4.0
 
 
 def longest_run(flags: Mask) -> int:
@@ -101,6 +102,16 @@ def judge_station(
         passed,
         virtual,
     )
+
+
+def with_rival(station: StationEstimate, odds: float) -> StationEstimate:
+    """The station when another place of the whole joint has the log-odds ``odds`` against it."""
+    status = station.status
+    if odds > _RIVAL_ODDS and status.name in ("ok", "weak"):
+        status = Status(
+            "ambiguous", f"another place along u explains the slice as well (log-odds {odds:.1f})"
+        )
+    return replace(station, rival_odds=odds, status=status)
 
 
 def _component(

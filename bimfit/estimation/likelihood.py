@@ -38,18 +38,18 @@ class BeamModel:
         A of log(1 + A exp(-d^2 / 2)): the odds of a return on the spot against an outlier there.
     miss : float
         log(e_m / (1 - e_m - e_o)): what a beam that returned nothing says against a face in its way.
+    past : float
+        The same for a beam that went past and returned from behind.
     table, scale : ndarray, shape (2, 2048), and float
         The logarithm above and a / (1 + a), a = A exp(-d^2 / 2), at d^2 = index * scale.
-    outlier_share : float
-        e_o.
     """
 
     sigma: float
     amplitude: float
     miss: float
+    past: float
     table: Array
     scale: float
-    outlier_share: float
 
     @classmethod
     def of(
@@ -60,11 +60,11 @@ class BeamModel:
         e_o = max(sensor.outlier_share if outliers is None else outliers, _SHARE_FLOOR)
         e_m = max(sensor.miss_share, _SHARE_FLOOR)
         amplitude = max(1.0 - e_o - e_m, 0.05) * sensor.max_range / (e_o * s * math.sqrt(2.0 * math.pi))
-        miss = math.log(e_m / max(1.0 - e_m - e_o, 0.05)) if sensor.missing_means_gap else 0.0
         table = np.empty((2, _TABLE))
         scale = 2.0 * math.log(max(amplitude, 2.0) / 1e-3) / (_TABLE - 1)
         _kernels.log_table(amplitude, scale, table)
-        return cls(s, amplitude, min(miss, 0.0), table, scale, e_o)
+        past = min(math.log(e_m / max(1.0 - e_m - e_o, 0.05)), 0.0)
+        return cls(s, amplitude, past if sensor.missing_means_gap else 0.0, past, table, scale)
 
 
 @dataclass(frozen=True)

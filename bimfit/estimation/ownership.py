@@ -7,8 +7,7 @@ passes between them, a second round repeats each posterior given the other compo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from bimfit.geometry.pose import Array
 
 Mask = NDArray[np.bool_]
 Ints = NDArray[np.int64]
-_BACKGROUND_DEPTH = 0.3
+_SAME_SURFACE = 0.05
 
 
 @dataclass(frozen=True)
@@ -102,43 +101,46 @@ def _best_cut(own: Ints, p: Array, cut: float) -> tuple[float, bool]:
     return float(cuts[i]), bool(crossed[i] < straight[i])
 
 
-def cover_cost(beams: BeamSet, model: BeamModel, background: Array | None = None) -> Array:
-    """What covering each beam adds to the log-likelihood besides its residual, shape (n,).
+@dataclass(frozen=True)
+class Cost:
+    """What covering each beam adds to the log-likelihood besides its residual.
 
-    Parameters
+    Attributes
     ----------
-    background : ndarray, shape (n,), optional
-        Log-odds that a return came from behind rather than from nowhere; counts against covering it.
+    off : ndarray, shape (n,)
+        Whatever it returned.
+    deep : ndarray, shape (n,)
+        When it returned from more than ``margin`` behind the surface that should have stopped it.
+    margin : float
+        m.
+    limit : ndarray, shape (n,)
+        Range at which something else is in the way, m.
     """
-    off = np.where(beams.r < 0.0, model.miss, 0.0)
-    return off if background is None else off - np.minimum(background, abs(model.miss))
+
+    off: Array
+    deep: Array
+    margin: float
+    limit: Array
+
+    def take(self, keep: Mask) -> Cost:
+        """The beams for which ``keep`` holds."""
+        return Cost(self.off[keep], self.deep[keep], self.margin, self.limit[keep])
 
 
-def background_odds(scene: Scene, beams: BeamSet, model: BeamModel, margin: float, max_range: float) -> Array:
-    """Log-odds of 'from a surface behind the joint' against 'outlier', 0 for every other beam; shape (n,).
+def cover_cost(beams: BeamSet, model: BeamModel, margin: float) -> Cost:
+    """Cost of covering beams when nothing is known of the other component.
 
-    A return counts as from behind when it lies more than ``margin`` past the components' surface (carried
-    on across the gap from the nearest covered beams) and a neighbouring beam does so too: floors come in
-    runs, outliers alone.
+    A beam that returned nothing, or from behind, speaks against a face in its way. Only a return that a
+    neighbouring beam bears out counts as from behind: floors come in runs, outliers alone.
     """
     n = len(beams)
-    out = np.zeros(n)
-    covered = np.flatnonzero(np.isfinite(scene.nearest))
-    if not len(covered):
-        return out
-    surface = np.interp(np.arange(n), covered, scene.nearest[covered])
-    depth = beams.r - surface
-    behind = (beams.r > 0.0) & (depth > margin)
-    run = np.zeros(n, bool)
-    pair = behind[1:] & behind[:-1] & (np.abs(np.diff(beams.r)) < 0.25 * np.maximum(depth[1:], depth[:-1]))
-    run[1:] |= pair
-    run[:-1] |= pair
-    count, missing = int(run.sum()), int((beams.r < 0.0).sum())
-    if count:
-        share = count / (count + missing + 1.0)
-        density = share / _BACKGROUND_DEPTH
-        out[run] = np.log1p(density * max_range / max(1e-3, model.outlier_share))
-    return out
+    borne_out = np.zeros(n, bool)
+    if n > 1:
+        pair = (np.abs(np.diff(beams.r)) < _SAME_SURFACE) & (beams.r[1:] > 0.0) & (beams.r[:-1] > 0.0)
+        borne_out[1:] |= pair
+        borne_out[:-1] |= pair
+    off = np.where(beams.r < 0.0, model.miss, 0.0)
+    return Cost(off, np.where(borne_out, model.past, 0.0), margin, np.full(n, np.inf))
 
 
 def explained_by(rho: Array, beams: BeamSet, model: BeamModel, sigma: float) -> Array:
@@ -151,26 +153,15 @@ def explained_by(rho: Array, beams: BeamSet, model: BeamModel, sigma: float) -> 
     return np.asarray(np.where(beams.r > 0.0, odds, 0.0))
 
 
-def first_round(
-    which: int, scene: Scene, side: Ints, beams: BeamSet, off: Array, model: BeamModel, blur: float
-) -> tuple[Mask, Array, Array]:
-    """Beams, costs and limits for one component when the other is known from the combined pose alone."""
+def first_round(which: int, scene: Scene, side: Ints) -> Mask:
+    """Beams for one component when the other is known from the combined pose alone."""
     own, other = scene.rho[which], scene.rho[1 - which]
-    hidden = np.isfinite(other) & (other < own)
-    use = (side == which) & ~(hidden & np.isfinite(own))
-    behind = np.isfinite(other) & (beams.r > 0.0)
-    cost = off.copy()
-    if behind.any():
-        odds = explained_by(other, beams, model, blur)
-        # only what lies deeper than this component's own surface tells against it
-        deeper = ~np.isfinite(own) | (other > own + 3.0 * blur)
-        cost -= np.where(behind & deeper, np.minimum(odds, abs(model.miss)), 0.0)
-    return use, cost, np.full(len(beams), np.inf)
+    return np.asarray((side == which) & ~(np.isfinite(own) & (other < own)))
 
 
 def second_round(
-    which: int, scene: Scene, side: Ints, beams: BeamSet, off: Array, model: BeamModel, *, territory: bool
-) -> tuple[Mask, Array, Array]:
+    which: int, scene: Scene, side: Ints, beams: BeamSet, cost: Cost, model: BeamModel, *, territory: bool
+) -> tuple[Mask, Cost]:
     """The same when the other component has been estimated.
 
     Returns that the other explains count for it; with ``territory`` they may not be claimed even by a
@@ -183,12 +174,12 @@ def second_round(
         claimed = np.isfinite(other) & (beams.r > 0.0) & (np.abs(beams.r - other) < 4.0 * sigma)
     foreign = claimed & (side != which)
     use = (side == which) | foreign | ((beams.r < 0.0) & ~np.isfinite(other))
-    cost = off - np.where(claimed, odds, 0.0)
+    off = cost.off - np.where(claimed, odds, 0.0)
     # a beam that the other should have returned speaks for neither when it did not
-    cost = np.where((beams.r < 0.0) & np.isfinite(other), 0.0, cost)
+    off = np.where((beams.r < 0.0) & np.isfinite(other), 0.0, off)
     if territory:
-        cost = cost - np.where(foreign, abs(model.miss), 0.0)
-    return use, cost, other + 3.0 * sigma
+        off = off - np.where(foreign, abs(model.past), 0.0)
+    return use, replace(cost, off=off, limit=other + 3.0 * sigma)
 
 
 def through(scene: Scene, side: Ints, beams: BeamSet, depth: float) -> int:
@@ -217,11 +208,6 @@ def through(scene: Scene, side: Ints, beams: BeamSet, depth: float) -> int:
         r = beams.r[s + i + 1 : s + j]
         count += int(((r < 0.0) | (r > surface + depth)).sum())
     return count
-
-
-def kept(mask: Mask, *arrays: Any) -> tuple[Any, ...]:
-    """Every array's rows where ``mask`` holds."""
-    return tuple(a[mask] for a in arrays)
 
 
 def beside_artificial_ends(

@@ -10,6 +10,7 @@ import numpy as np
 
 from bimfit.estimation import _kernels
 from bimfit.estimation.likelihood import BeamModel, BeamSet
+from bimfit.estimation.ownership import Cost
 from bimfit.geometry.pose import Array, Pose2D
 
 _CELLS = 24
@@ -95,8 +96,7 @@ def component_posterior(
     rows: Array,
     start: Pose2D,
     beams: BeamSet,
-    off: Array,
-    lim: Array,
+    cost: Cost,
     centred_on: Array,
     model: BeamModel,
     window: Window,
@@ -110,8 +110,8 @@ def component_posterior(
         Edges of the designed component, :func:`~bimfit.estimation.likelihood.edge_rows`.
     start : Pose2D
         The pose that the prior is centred on.
-    off, lim : ndarray, shape (n,)
-        Per beam: what covering it adds to the log-likelihood, and the range at which it is blocked.
+    cost : Cost
+        What covering each beam adds to the log-likelihood.
     centred_on : ndarray, shape (k, 2)
         Returns on the component, whose centroid becomes the pivot.
     begin : Pose2D, optional
@@ -132,7 +132,8 @@ def component_posterior(
     spread = (_BEARING * beams.spacing / model.sigma) ** 2
     mean, cov, info = np.empty(3), np.empty((3, 3)), np.zeros(12)
     _kernels.posterior(
-        moved, radius, set_.p, set_.d, set_.r, set_.start, set_.eye, off, lim, model.sigma, spread,
+        moved, radius, set_.p, set_.d, set_.r, set_.start, set_.eye, cost.off, cost.deep,
+        cost.margin, cost.limit, model.sigma, spread,
         model.table, model.scale, np.array([window.shift, window.shift, window.angle]), first,
         window.reach, window.least, _CELLS, _draws(), mean, cov, info,
     )  # fmt: skip

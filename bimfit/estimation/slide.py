@@ -11,6 +11,7 @@ import numpy as np
 from bimfit.config import FitConfig, SensorConfig
 from bimfit.estimation import _kernels
 from bimfit.estimation.likelihood import BeamModel, BeamSet, edge_rows
+from bimfit.estimation.ownership import Cost
 from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.pose import Array, Pose2D
 
@@ -35,6 +36,8 @@ class SlideResult:
         The shift chosen, m.
     rival_odds : float
         Log-odds of the best place more than most of a gap away, against the one chosen.
+    rival : Pose2D or None
+        That place.
     """
 
     pose: Pose2D
@@ -42,17 +45,18 @@ class SlideResult:
     scores: Array
     shift: float = 0.0
     rival_odds: float = -math.inf
+    rival: Pose2D | None = None
 
 
 def slide_combined(
-    section: JointSection, beams: BeamSet, off: Array, pose: Pose2D, sensor: SensorConfig, fit: FitConfig
+    section: JointSection, beams: BeamSet, cost: Cost, pose: Pose2D, sensor: SensorConfig, fit: FitConfig
 ) -> SlideResult:
     """Score the union of both components along u and keep the best shift.
 
     Parameters
     ----------
-    off : ndarray, shape (n,)
-        What covering each beam costs or gains besides its residual (see :mod:`bimfit.estimation.station`).
+    cost : Cost
+        What covering each beam adds besides its residual.
     """
     gap = designed_width(section)
     step = min(_STEP, max(gap / 8.0, 0.1 * _STEP))
@@ -67,39 +71,44 @@ def slide_combined(
     scores = np.empty(len(shifts))
     a, b = (edge_rows(component) for component in section.components)
     _kernels.slide(
-        a, b, pose.as_array(), shifts[:, None] * axis, beams.p, beams.d, beams.r, beams.start, beams.eye, off,
-        model.sigma, model.table, model.scale, _PRIOR, scores,
+        a, b, pose.as_array(), shifts[:, None] * axis, beams.p, beams.d, beams.r, beams.start, beams.eye,
+        cost.off, cost.deep, cost.margin,
+        model.sigma, model.table, model.scale, min(_PRIOR, max(0.8 * gap, 0.010)), scores,
     )  # fmt: skip
     best = int(np.argmax(scores))
     moved = Pose2D(pose.u + shifts[best] * axis[0], pose.v + shifts[best] * axis[1], pose.theta)
-    away = np.abs(shifts - shifts[best]) > max(0.8 * gap, _APART)
-    odds = float((scores[away] - scores[best]).max()) if away.any() else -math.inf
-    return SlideResult(moved, shifts, scores, float(shifts[best]), odds)
+    away = np.flatnonzero(np.abs(shifts - shifts[best]) > max(0.8 * gap, _APART))
+    odds, rival = -math.inf, None
+    if len(away):
+        other = int(away[np.argmax(scores[away])])
+        odds = float(scores[other] - scores[best])
+        rival = Pose2D(pose.u + shifts[other] * axis[0], pose.v + shifts[other] * axis[1], pose.theta)
+    return SlideResult(moved, shifts, scores, float(shifts[best]), odds, rival)
 
 
 def best_start(
     section: JointSection,
     beams: BeamSet,
-    off: Array,
+    cost: Cost,
     poses: Sequence[Pose2D],
     sensor: SensorConfig,
     fit: FitConfig,
 ) -> SlideResult:
     """Slide from every pose, the combined one first, and keep the best; the others become its rivals."""
-    slid = [slide_combined(section, beams, off, pose, sensor, fit) for pose in poses]
+    slid = [slide_combined(section, beams, cost, pose, sensor, fit) for pose in poses]
     top = [float(result.scores.max()) for result in slid]
     best = int(np.argmax(top))
     chosen = slid[best]
-    odds = chosen.rival_odds
+    odds, rival = chosen.rival_odds, chosen.rival
     for result, score in zip(slid, top, strict=True):
         apart = math.hypot(result.pose.u - chosen.pose.u, result.pose.v - chosen.pose.v)
-        if apart > max(0.8 * designed_width(section), _APART):
-            odds = max(odds, score - top[best])
+        if apart > max(0.8 * designed_width(section), _APART) and score - top[best] > odds:
+            odds, rival = score - top[best], result.pose
     shift = float(
         (chosen.pose.u - poses[0].u) * math.cos(poses[0].theta)
         + (chosen.pose.v - poses[0].v) * math.sin(poses[0].theta)
     )
-    return replace(chosen, shift=shift, rival_odds=odds)
+    return replace(chosen, shift=shift, rival_odds=odds, rival=rival)
 
 
 def designed_width(section: JointSection) -> float:

@@ -14,10 +14,10 @@ from bimfit.estimation import checks
 from bimfit.estimation.cloud import virtual_beams
 from bimfit.estimation.likelihood import BeamModel, BeamSet, edge_rows, predict_ranges
 from bimfit.estimation.ownership import (
+    Cost,
     Ints,
     Mask,
     Scene,
-    background_odds,
     beside_artificial_ends,
     cover_cost,
     first_round,
@@ -37,6 +37,7 @@ _NEAR = 0.03
 _CLIP_MARGIN = 0.025
 _MIN_HITS = 3
 _FEW_THROUGH = 3
+_WORTH_A_LOOK = -15.0
 
 
 @dataclass(frozen=True)
@@ -103,8 +104,23 @@ def estimate_station(
         beams = BeamSet.of(slice_.beams)
     rows = (edge_rows(section.components[0]), edge_rows(section.components[1]))
     context = _Context(section, beams, rows, BeamModel.of(sensor), sensor, fit, virtual is not None)
-    slid, off = _place(context, combined, rivals)
-    return _components(context, slice_, slid, off, component_matches, virtual.reason if virtual else "")
+    slid, cost = _place(context, combined, rivals)
+    reason = virtual.reason if virtual else ""
+    best = _components(context, slice_, slid, cost, component_matches, reason)
+    if slid.rival is None or slid.rival_odds < _WORTH_A_LOOK:
+        return best
+    # the slide's blur cannot tell the two apart for certain; both fitted at the sensor's sigma can
+    turned = dataclasses.replace(slid, pose=slid.rival, rival=slid.pose)
+    other = _components(context, slice_, turned, cost, (None, None), reason)
+    odds = _evidence(other) - _evidence(best)
+    if odds > 0.0:
+        best, odds = other, -odds
+    return checks.with_rival(best, odds)
+
+
+def _evidence(estimate: StationEstimate) -> float:
+    """Log evidence of both components; one that cannot be seen explains nothing."""
+    return sum(c.posterior.evidence for c in estimate.components if c.posterior is not None)
 
 
 def _nothing(
@@ -123,8 +139,9 @@ def _scene(context: _Context, poses: Sequence[Pose2D]) -> Scene:
     return Scene((met[0][0], met[1][0]), (met[0][1], met[1][1]))
 
 
-def _blur(context: _Context) -> float:
-    return math.hypot(context.sensor.sigma, 1.2 * context.fit.placement_sigma)
+def _depth(context: _Context) -> float:
+    """A return that much behind a surface went past it, m."""
+    return max(4.0 * context.sensor.sigma, 1.5 * context.fit.placement_sigma)
 
 
 def _usable(context: _Context, scene: Scene, side: Ints, pose: Pose2D) -> Mask:
@@ -136,18 +153,15 @@ def _usable(context: _Context, scene: Scene, side: Ints, pose: Pose2D) -> Mask:
     return ~beside_artificial_ends(scene, side, context.beams, edges, surface, _CLIP_MARGIN)
 
 
-def _place(context: _Context, combined: Pose2D, rivals: Sequence[Pose2D]) -> tuple[SlideResult, Array]:
+def _place(context: _Context, combined: Pose2D, rivals: Sequence[Pose2D]) -> tuple[SlideResult, Cost]:
     """Slide the combined pose and its rivals; what covering a beam costs there."""
     scene = _scene(context, (combined, combined))
     side = split_side(scene, context.beams, np.array([combined.u, combined.v]))
-    odds = background_odds(
-        scene, context.beams, context.model, 1.5 * context.fit.placement_sigma, context.sensor.max_range
-    )
-    off = cover_cost(context.beams, context.model, odds)
+    cost = cover_cost(context.beams, context.model, _depth(context))
     usable = _usable(context, scene, side, combined)
-    beams, off_used = (context.beams, off) if usable.all() else (context.beams.take(usable), off[usable])
-    slid = best_start(context.section, beams, off_used, (combined, *rivals), context.sensor, context.fit)
-    return slid, off
+    beams, used = (context.beams, cost) if usable.all() else (context.beams.take(usable), cost.take(usable))
+    slid = best_start(context.section, beams, used, (combined, *rivals), context.sensor, context.fit)
+    return slid, cost
 
 
 def _window(context: _Context) -> Window:
@@ -161,7 +175,7 @@ def _components(
     context: _Context,
     slice_: Slice,
     slid: SlideResult,
-    off: Array,
+    cost: Cost,
     matches: tuple[Pose2D | None, Pose2D | None],
     reason: str,
 ) -> StationEstimate:
@@ -172,22 +186,19 @@ def _components(
     window = _window(context)
     first: list[Posterior | None] = []
     for which in (0, 1):
-        use, cost, limit = first_round(which, scene, side, beams, off, context.model, _blur(context))
-        first.append(_one(context, which, pose, use & usable, cost, limit, window, matches[which]))
+        use = first_round(which, scene, side)
+        first.append(_one(context, which, pose, use & usable, cost, window, matches[which]))
     posteriors = first
     poses = [p.pose if p is not None else pose for p in posteriors]
     scene = _scene(context, poses)
-    depth = max(4.0 * context.sensor.sigma, 1.5 * context.fit.placement_sigma)
+    depth = _depth(context)
     passed = through(scene, side, beams, depth)
     both = np.isfinite(scene.rho[0]) & np.isfinite(scene.rho[1])
     if all(p is not None for p in first) and (bool(np.any(both & usable)) or passed < _FEW_THROUGH):
         posteriors = list(first)
         for which in (0, 1):
-            use, cost, limit = second_round(
-                which, scene, side, beams, off, context.model, territory=passed > 0
-            )
-            begin = poses[which]
-            posteriors[which] = _one(context, which, pose, use & usable, cost, limit, window, begin)
+            use, spent = second_round(which, scene, side, beams, cost, context.model, territory=passed > 0)
+            posteriors[which] = _one(context, which, pose, use & usable, spent, window, poses[which])
             poses[which] = posteriors[which].pose if posteriors[which] is not None else pose  # type: ignore[union-attr]
             scene = _scene(context, poses)
         passed = through(scene, side, beams, depth)
@@ -212,7 +223,7 @@ def _corner_step(context: _Context, which: int, pose: Pose2D) -> float:
 
 
 def _one(
-    context: _Context, which: int, prior: Pose2D, use: Mask, cost: Array, limit: Array, window: Window,
+    context: _Context, which: int, prior: Pose2D, use: Mask, cost: Cost, window: Window,
     begin: Pose2D | None,
 ) -> Posterior | None:  # fmt: skip
     """Posterior of one component from the beams in ``use``; None where hardly any meets it."""
@@ -222,7 +233,7 @@ def _one(
     if int(near.sum()) < _MIN_HITS:
         return None
     points = beams.points[near]
-    args = (beams, cost[use], limit[use], points, context.model, window)
+    args = (beams, cost.take(use), points, context.model, window)
     result = component_posterior(context.rows[which], prior, *args)
     if begin is not None and _apart(begin, result.pose, result.pivot, context.sensor.sigma):
         other = component_posterior(context.rows[which], prior, *args, begin=begin)
