@@ -133,6 +133,7 @@ def _legs(faces: Faces, frames: PairFrames, strips: Strips, limits: Limits) -> d
                 high=float(strips.gap_max[k]),
                 area=float(strips.area[k]),
                 closed=closed,
+                legs=(length,),
             )
         )
     return groups
@@ -212,7 +213,8 @@ def _finish(faces: Faces, rows: Sequence[tuple[Key, Leg]]) -> list[Draft]:
         axes = (u[k : k + 1], v[k : k + 1]) if leg.straight else _axes(np.diff(leg.points, axis=0), leg.u)[1:]
         path = _path(leg, faces.origin, *axes, flip=bool(flip[k]))
         sides = (bool(free[k, 0]), bool(free[k, 1]))
-        whole = replace(leg, depth=leg.depth + float(shape.prepared[k]))
+        deeper = float(shape.prepared[k])
+        whole = replace(leg, depth=leg.depth + deeper) if deeper else leg
         sides = sides[::-1] if flip[k] else sides
         out.append(Draft(key[0], key[1], key[2], key[3], str(shape.kind[k]), whole, path, sides))
     return out

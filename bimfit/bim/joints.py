@@ -26,7 +26,9 @@ _NEVER = (
     "IfcCable", "IfcSpatial", "IfcGrid", "IfcPort", "IfcSite", "IfcBuildingStorey",
 )
 # fmt: on
+_NEVER_LOWER = tuple(name.lower() for name in _NEVER)
 _STATES = ("open", "filled", "touch", "clash")
+_RANK = {state: rank for rank, state in enumerate(_STATES)}
 _HIDDEN = ("sheet", "patch")
 _DIGITS = "23456789abcdefghjkmnpqrstvwxyz"
 _ID_LENGTH, _MOST_DIGITS = 5, 12
@@ -77,7 +79,7 @@ def joint_between(model: Model, guid_a: str, guid_b: str, config: JointConfig | 
     joints = _pair_joints(model, first, second, config)
     if not joints:
         raise JointError(_why_none(first, second), file=model.path)
-    return min(joints, key=lambda joint: (_STATES.index(joint.state), -joint.length))
+    return min(joints, key=lambda joint: (_RANK[joint.state], -joint.length))
 
 
 def select_joints(
@@ -210,7 +212,7 @@ def _eligible(element: Element, config: JointConfig) -> bool:
         return False
     if config.classes:
         return any(kind.startswith(name.lower()) for name in config.classes)
-    return not any(kind.startswith(name.lower()) for name in _NEVER)
+    return not kind.startswith(_NEVER_LOWER)
 
 
 def _listed(joint: Joint, config: JointConfig) -> bool:
@@ -235,7 +237,7 @@ def _joints(elements: Sequence[Element], eligible: NDArray[np.bool_], limits: Li
         numbered.extend((f"{name} {k}", draft) for k, draft in enumerate(sorted(by_pair[pair], key=_place)))
     ids = _ids([name for name, _ in numbered])
     joints = [_joint(i, draft, elements) for i, (_, draft) in zip(ids, numbered, strict=True)]
-    return tuple(sorted(joints, key=lambda joint: _STATES.index(joint.state)))
+    return tuple(sorted(joints, key=lambda joint: _RANK[joint.state]))
 
 
 def _related(a: Element, b: Element) -> bool:
@@ -245,7 +247,7 @@ def _related(a: Element, b: Element) -> bool:
 def _place(draft: Draft) -> tuple[float, ...]:
     """What orders the joints of one pair: state, length, then the place to a millimetre."""
     middle = np.round(draft.path.points.mean(axis=0), 3)
-    return (float(_STATES.index(draft.state)), -round(draft.leg.length, 3), *(float(x) for x in middle))
+    return (float(_RANK[draft.state]), -round(draft.leg.length, 3), *(float(x) for x in middle))
 
 
 def _ids(names: Sequence[str]) -> list[str]:

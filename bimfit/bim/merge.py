@@ -46,7 +46,7 @@ class Leg:
     low: float
     high: float
     area: float
-    legs: tuple[float, ...] = ()
+    legs: tuple[float, ...]
     closed: bool = False
     groove: bool = False
 
@@ -76,15 +76,11 @@ class Leg:
 def merge(legs: Sequence[Leg]) -> list[Leg]:
     """Join the strips of one pair and state: facets turned, runs of one plane, steps, then end to end."""
     if len(legs) < 2:
-        return [_with_legs(leg) for leg in legs]
+        return list(legs)
     out = _turn_facets(list(legs))
     out = _join_collinear(out)
     out = _join_steps(out)
-    return _join_ends([_with_legs(leg) for leg in out])
-
-
-def _with_legs(leg: Leg) -> Leg:
-    return leg if leg.legs else replace(leg, legs=(leg.length,))
+    return _join_ends(out)
 
 
 def _likely(
@@ -139,7 +135,7 @@ def _turn_facets(legs: list[Leg]) -> list[Leg]:
 def _turned(leg: Leg) -> Leg:
     middle, side = leg.middle, leg.side
     points = np.stack([middle - 0.5 * leg.depth * side, middle + 0.5 * leg.depth * side])
-    return replace(leg, points=points, length=leg.depth, depth=leg.length)
+    return replace(leg, points=points, length=leg.depth, depth=leg.length, legs=(leg.depth,))
 
 
 def _neighbours_across(a: Leg, b: Leg) -> bool:
@@ -194,6 +190,7 @@ def _collinear(a: Leg, b: Leg) -> Leg | None:
         low=min(a.low, b.low),
         high=max(a.high, b.high),
         area=a.area + b.area,
+        legs=(length,),
     )
 
 

@@ -358,6 +358,18 @@ def test_what_a_script_reads():
     assert set(plain) >= {"id", "elements", "kind", "designed"}
 
 
+def test_every_joint_of_a_large_facade():
+    panels = [
+        box((3.0 * c, 0, 3.0 * r), (3.0 * c + 2.98, 0.14, 3.0 * r + 2.98))
+        for c in range(20)
+        for r in range(15)
+    ]
+    found = find_joints(model(*panels))
+    assert len(found) == 19 * 15 + 20 * 14
+    assert len({j.id for j in found}) == len(found)
+    assert all(j.width == pytest.approx(0.02, abs=1e-9) for j in found)
+
+
 PAIRS = [
     ("XELLA-3e_verdieping", "0IjRD_pxn9aRaRUWq6Ebnq,2geNRwqjn30uvGChtbfnYT", 3.0, 643),
     ("XELLA-3e_verdieping", "2Xvgd3_obAS9WBKxab2dfp,18Su4zPSrECA7LPdeiBdes", 30.0, 2711),
