@@ -86,7 +86,7 @@ class LineScan:
         k = self.returned
         return np.asarray(self.origins[k] + self.directions[k] * self.ranges[k, None])
 
-    @property
+    @cached_property
     def bounds(self) -> Array:
         """Least and greatest corner of what was hit, shape (2, 3); NaN where nothing was."""
         points = self.hits

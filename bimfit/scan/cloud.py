@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -49,7 +50,7 @@ class PointCloud:
     def __len__(self) -> int:
         return len(self.points)
 
-    @property
+    @cached_property
     def bounds(self) -> Array:
         """Least and greatest corner, shape (2, 3); NaN where there is no point."""
         if not len(self.points):

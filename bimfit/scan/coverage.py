@@ -72,7 +72,7 @@ def scan_stations(
         Ascending, within [0, length]; empty where the scan does not show the joint.
     """
     sweeps = np.zeros(0)
-    if isinstance(scan, LineScan):
+    if isinstance(scan, LineScan) and _near(scan, path, reach):
         sweeps = sweep_positions(scan, _path_grid(path), path, reach)
     if spacing is not None:
         s = sweeps if len(sweeps) else _along(scan, path, reach)[0]
@@ -127,6 +127,13 @@ def _path_grid(path: JointPath) -> StationGrid:
     return StationGrid.of([path.rough_frame(float(x)) for x in s], s)
 
 
+def _near(scan: LineScan | PointCloud, path: JointPath, reach: float) -> bool:
+    """Whether the boxes around scan and path meet: with many joints, most are settled by this."""
+    low, high = path.points.min(axis=0) - reach, path.points.max(axis=0) + reach
+    with np.errstate(invalid="ignore"):
+        return bool(np.all(scan.bounds[0] <= high) and np.all(scan.bounds[1] >= low))
+
+
 def _along(scan: LineScan | PointCloud, path: JointPath, reach: float) -> tuple[Array, float]:
     """Where along a path its neighbouring returns are, and about how many there are.
 
@@ -136,6 +143,8 @@ def _along(scan: LineScan | PointCloud, path: JointPath, reach: float) -> tuple[
         Of an even sample of them, m; beyond the path's ends there are none.
     count : float
     """
+    if not _near(scan, path, reach):
+        return np.zeros(0), 0.0
     low, high = path.points.min(axis=0) - reach, path.points.max(axis=0) + reach
     found = []
     for start in range(0, len(scan), CHUNK):
