@@ -19,6 +19,15 @@ from bimfit.geometry.status import OK, Status
 
 Mask = NDArray[np.bool_]
 _RIVAL_ODDS = -4.0
+_RIVAL_MASS = 0.2
+_INLIERS = 0.5
+_RUN = 6
+_CUSUM = 2.3
+_CHI2 = 4.0
+_CONTINUES = 4
+_EDGE = 3.5
+_BY_CHANCE = 0.05
+_TURNED = 3.0
 
 
 def longest_run(flags: Mask) -> int:
@@ -41,13 +50,6 @@ def residuals_of(beams: BeamSet, rho: Array, face: NDArray[np.int64], used: Mask
     k = len(z)
     lag = float(np.mean(z[1:] * z[:-1]) / max(float(np.mean(z * z)), 1e-30)) if k > 3 else 0.0
     walk = np.concatenate([[0.0], np.cumsum(z - z.mean())]) if k else np.zeros(1)
-    open_ = used & (face < 0) & (beams.r > 0.0)
-    surface = rho[covered]
-    unexplained = 0
-    if n and open_.any():
-        at = np.flatnonzero(covered)
-        level = np.interp(np.flatnonzero(open_), at, surface)
-        unexplained = int((np.abs(beams.r[open_] - level) < 4.0 * sigma).sum())
     return Residuals(
         n_beams=int(used.sum()),
         n_covered=n,
@@ -58,12 +60,45 @@ def residuals_of(beams: BeamSet, rho: Array, face: NDArray[np.int64], used: Mask
         miss_share=float((~returned).sum() / n) if n else 0.0,
         outlier_run=longest_run(returned & ~inlier),
         miss_run=longest_run(~returned),
-        cusum=float((walk.max() - walk.min()) / sigma / math.sqrt(max(k, 1))),
+        cusum=float((walk.max() - walk.min()) / max(float(z.std()), 1e-9) / math.sqrt(k)) if k > 3 else 0.0,
         lag1=lag,
-        unexplained=unexplained,
+        unexplained=_continues(beams, rho, covered, used, sigma),
+        edge=_edge_drop(z, face[covered][inlier], sigma),
         residuals=z,
         places=beams.points[covered][inlier],
     )
+
+
+def _edge_drop(z: Array, face: NDArray[np.int64], sigma: float) -> float:
+    """How far the last returns at either end of the main face lie behind it, in standard deviations."""
+    if len(z) < 12:
+        return 0.0
+    names, counts = np.unique(face, return_counts=True)
+    main = z[face == names[np.argmax(counts)]]
+    worst = 0.0
+    for end in (main, main[::-1]):
+        total = np.cumsum(end[:6])
+        worst = max(worst, float((total / np.sqrt(np.arange(1, len(total) + 1))).max()))
+    return worst / max(sigma, float(main.std()) * 0.8)
+
+
+def _continues(beams: BeamSet, rho: Array, covered: Mask, used: Mask, sigma: float) -> int:
+    """Returns that carry a surface on past where it should end: the edge is not shaped as designed."""
+    longest = 0
+    for g in range(len(beams.eye)):
+        s, t = int(beams.start[g]), int(beams.start[g + 1])
+        at = np.flatnonzero(covered[s:t])
+        if not len(at):
+            continue
+        for first, step in ((s + int(at[0]), -1), (s + int(at[-1]), 1)):
+            level = float(rho[first])
+            jump = max(4.0 * sigma, 3.0 * beams.spacing * level)
+            count, k = 0, first + step
+            while s <= k < t and used[k] and beams.r[k] > 0.0 and abs(beams.r[k] - level) < jump:
+                level = float(beams.r[k])
+                count, k = count + 1, k + step
+            longest = max(longest, count)
+    return longest
 
 
 def judge_station(
@@ -81,13 +116,16 @@ def judge_station(
     virtual: bool,
 ) -> StationEstimate:
     """Put a station together and say what may be believed of it."""
-    components = tuple(
+    made = [
         replace(_component(p, r, slid.pose, window, sensor, fit), corner_step=step)
         for p, r, step in zip(posteriors, residuals, steps, strict=True)
-    )
-    status = OK
+    ]
+    components = (made[0], made[1])
+    covered = sum(r.n_covered for r in residuals)
+    status = _joint_status(section, components, slid.pose, fit, passed, steps, sensor, covered)
     for name, c in zip("AB", components, strict=True):
-        if (not c.status.measured and status.measured) or (c.status.name != "ok" and status.name == "ok"):
+        worse = status.measured if not c.status.measured else status.name == "ok"
+        if c.status.name != "ok" and worse:
             status = Status(c.status.name, f"component {name}: {c.status.reason}")
     if status.name == "ok" and reason:
         status = Status("weak", reason)
@@ -120,24 +158,81 @@ def _component(
 ) -> ComponentEstimate:  # fmt: skip
     if posterior is None:
         return ComponentEstimate(status=Status("no_data", "hardly any return lies on the component"))
-    status, weak = OK, ""
-    if residuals.n_inliers < fit.min_points:
-        status = Status("rejected", f"only {residuals.n_inliers} returns lie on the component")
-    elif posterior.weak_sd > 0.3 * window.shift:
-        weak = _direction(posterior)
-        status = Status(
-            "weak", f"the data do not fix it {weak}: standard deviation {posterior.weak_sd * 1e3:.1f} mm"
-        )
-    elif posterior.rival_mass > 0.2:
-        status = Status(
-            "ambiguous",
-            f"another place {posterior.rival_offset * 1e3:+.1f} mm away explains the data as well",
-        )
+    status, weak = _component_status(posterior, residuals, prior, window, fit)
     rivals: tuple[Rival, ...] = ()
     return ComponentEstimate(
         posterior.pose, posterior.covariance, status, rivals, residuals.n_inliers, residuals.rms, weak,
         posterior, residuals, prior, (window.shift, window.shift, window.angle),
     )  # fmt: skip
+
+
+def _component_status(
+    posterior: Posterior, r: Residuals, prior: Pose2D, window: Window, fit: FitConfig
+) -> tuple[Status, str]:
+    """Verdict on one component, and the name of its weak direction."""
+    pivot = posterior.pivot
+    moved = float(np.hypot(*(posterior.pose.apply(prior.inverse().apply(pivot)) - pivot)))
+    turned = abs(posterior.pose.theta - prior.theta)
+    if r.n_inliers < fit.min_points:
+        return Status("rejected", f"only {r.n_inliers} returns lie on the component"), ""
+    if r.n_inliers < _INLIERS * r.n_covered:
+        share = f"{r.n_inliers} of the {r.n_covered} beams that should meet the component"
+        return Status("rejected", f"only {share} return from it"), ""
+    if max(r.miss_run, r.outlier_run) >= _RUN:
+        what = "return nothing" if r.miss_run >= r.outlier_run else "return from elsewhere"
+        run = max(r.miss_run, r.outlier_run)
+        return Status("rejected", f"{run} beams in a row that should meet the component {what}"), ""
+    if r.cusum > _CUSUM or r.chi2 > _CHI2:
+        return Status("rejected", "the returns bend away from the designed shape"), ""
+    if r.edge > _EDGE:
+        return Status("rejected", "its surface drops off before its designed edge"), ""
+    if r.unexplained >= _CONTINUES:
+        reason = f"{r.unexplained} returns carry its surface on past its designed edge"
+        return Status("rejected", reason), ""
+    if moved > 2.5 * window.shift or turned > _TURNED * window.angle:
+        where = f"{moved * 1e3:.0f} mm and {math.degrees(turned):.1f} degrees from the joint's common pose"
+        return Status("rejected", f"it lies {where}, more than the placement tolerance allows"), ""
+    if posterior.weak_sd > 0.3 * window.shift:
+        weak = _direction(posterior)
+        sd = f"standard deviation {posterior.weak_sd * 1e3:.1f} mm"
+        return Status("weak", f"the data do not fix it {weak}: {sd}"), weak
+    if posterior.rival_mass > _RIVAL_MASS:
+        where = f"{posterior.rival_offset * 1e3:+.1f} mm away"
+        return Status("ambiguous", f"another place {where} explains the data as well"), ""
+    return OK, ""
+
+
+def _joint_status(
+    section: JointSection,
+    components: tuple[ComponentEstimate, ...],
+    pose: Pose2D,
+    fit: FitConfig,
+    passed: int,
+    steps: tuple[float, float],
+    sensor: SensorConfig,
+    covered: int,
+) -> Status:
+    """Verdict on the two components together: whether there is a gap, and whether it can be this one."""
+    a, b = components
+    if a.pose is None or b.pose is None:
+        return OK
+    designed = section.gap.mouth[1] - section.gap.mouth[0]
+    now = b.pose.apply(section.gap.mouth[1]) - a.pose.apply(section.gap.mouth[0])
+    across = designed / max(float(np.hypot(*designed)), 1e-9)
+    widened = float(pose.turn(across) @ now) - float(np.hypot(*designed))
+    if abs(widened) > 2.0 * fit.placement_tolerance:
+        how = "wider" if widened > 0.0 else "narrower"
+        return Status("rejected", f"the gap would be {abs(widened) * 1e3:.0f} mm {how} than designed")
+    beams = abs(steps[1] - steps[0]) if all(math.isfinite(x) for x in steps) else 0.0
+    if beams < 1.0 and passed == 0:
+        return Status(
+            "weak", "no beam passes between the components: the gap is narrower than the beams' spacing"
+        )
+    if passed == 0:
+        return Status("weak", "no beam passes between the components: closed, filled, or not a gap at all")
+    if passed and covered * max(sensor.miss_share, 1e-3) ** passed > _BY_CHANCE:
+        return Status("weak", f"only {passed} beams pass between the components: they may be drop-outs")
+    return OK
 
 
 def _direction(posterior: Posterior) -> str:

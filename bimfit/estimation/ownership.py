@@ -182,32 +182,39 @@ def second_round(
     return use, replace(cost, off=off, limit=other + 3.0 * sigma)
 
 
-def through(scene: Scene, side: Ints, beams: BeamSet, depth: float) -> int:
-    """How many beams between the two components went past them: missing, or from behind.
+def through(corners: tuple[Array, Array], beams: BeamSet, depth: float) -> int:
+    """How many beams went in between the two mouth corners: missing, or back from deeper than the mouth.
 
     Parameters
     ----------
+    corners : tuple of two ndarray, shape (2,)
+        Mouth corners of A and B as built.
     depth : float
-        A return that much farther than the neighbouring surface went past, m.
+        A return that much farther than the corners went past them, m.
+
+    Returns
+    -------
+    int
+        0 as well where fewer than half of the beams between the corners did so: then something is there.
     """
-    owner = scene.owner
-    count = 0
+    passed = between = 0
     for g in range(len(beams.eye)):
         s, t = int(beams.start[g]), int(beams.start[g + 1])
         if t - s < 3:
             continue
-        seen = np.flatnonzero(owner[s:t] >= 0)
-        change = np.flatnonzero(np.diff(side[s:t]) != 0)
-        if len(seen) < 2 or len(change) != 1:
-            continue
-        left, right = seen[seen <= change[0]], seen[seen > change[0]]
-        if not len(left) or not len(right):
-            continue
-        i, j = int(left[-1]), int(right[0])
-        surface = max(scene.nearest[s + i], scene.nearest[s + j])
-        r = beams.r[s + i + 1 : s + j]
-        count += int(((r < 0.0) | (r > surface + depth)).sum())
-    return count
+        ox, oy, lx, ly = beams.eye[g]
+        bearing, level = [], 0.0
+        for x, y in corners:
+            dx, dy = x - ox, y - oy
+            bearing.append(_kernels.pseudo_angle(lx * dx + ly * dy, lx * dy - ly * dx))
+            level = max(level, float(np.hypot(dx, dy)))
+        p = beams.p[s:t]
+        step = 0.5 * float(np.median(np.diff(p)))
+        lo, hi = np.searchsorted(p, (min(bearing) - step, max(bearing) + step))
+        r = beams.r[s + lo : s + hi]
+        passed += int(((r < 0.0) | (r > level + depth)).sum())
+        between += len(r)
+    return passed if 2 * passed >= between else 0
 
 
 def beside_artificial_ends(

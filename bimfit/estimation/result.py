@@ -33,7 +33,9 @@ class Residuals:
     lag1 : float
         Correlation of neighbouring residuals.
     unexplained : int
-        Returns near the component's plane that the estimate leaves uncovered.
+        Returns that carry the component's surface on past where it should end.
+    edge : float
+        How far the last returns at an end of the main face lie behind it, in standard deviations.
     residuals, places : ndarray, shape (n_inliers,) and (n_inliers, 2)
         Residuals, m, and where on the designed component they lie.
     """
@@ -50,6 +52,7 @@ class Residuals:
     cusum: float = 0.0
     lag1: float = 0.0
     unexplained: int = 0
+    edge: float = 0.0
     residuals: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     places: Array = field(default_factory=lambda: np.zeros((0, 2)), repr=False)
 

@@ -144,6 +144,12 @@ def _depth(context: _Context) -> float:
     return max(4.0 * context.sensor.sigma, 1.5 * context.fit.placement_sigma)
 
 
+def _through(context: _Context, poses: Sequence[Pose2D]) -> int:
+    """Beams that went in between the components' mouth corners."""
+    a, b = (pose.apply(m) for pose, m in zip(poses, context.section.gap.mouth, strict=True))
+    return through((a, b), context.beams, _depth(context))
+
+
 def _usable(context: _Context, scene: Scene, side: Ints, pose: Pose2D) -> Mask:
     components = context.section.components
     surface = (components[0].surface, components[1].surface)
@@ -191,8 +197,7 @@ def _components(
     posteriors = first
     poses = [p.pose if p is not None else pose for p in posteriors]
     scene = _scene(context, poses)
-    depth = _depth(context)
-    passed = through(scene, side, beams, depth)
+    passed = _through(context, poses)
     both = np.isfinite(scene.rho[0]) & np.isfinite(scene.rho[1])
     if all(p is not None for p in first) and (bool(np.any(both & usable)) or passed < _FEW_THROUGH):
         posteriors = list(first)
@@ -201,7 +206,7 @@ def _components(
             posteriors[which] = _one(context, which, pose, use & usable, spent, window, poses[which])
             poses[which] = posteriors[which].pose if posteriors[which] is not None else pose  # type: ignore[union-attr]
             scene = _scene(context, poses)
-        passed = through(scene, side, beams, depth)
+        passed = _through(context, poses)
     residuals = [
         _residuals(context, which, scene, side, usable) if posteriors[which] is not None else Residuals()
         for which in (0, 1)
