@@ -25,7 +25,7 @@ def is_number(cell):
     return True
 
 
-@settings(max_examples=400)
+@settings(max_examples=150)
 @given(st.lists(st.one_of(PLAIN.filter(is_number), FLOATS, PRINTED), min_size=1, max_size=12))
 def test_every_bit_is_that_of_float(cells):
     block = (",".join(cells) + "\n").encode() * 2
@@ -56,13 +56,13 @@ def test_full_precision_survives_repr():
 
 
 def test_pieces_join_seamlessly(monkeypatch):
-    rows = [f"{k},{k / 7!r},{-k}" for k in range(1000)]
+    rows = [f"{k},{k / 7!r},{-k}" for k in range(300)]
     block = ("\n".join(rows) + "\n").encode()
     whole = parse_columns(block, ord(","), 3, [2, 1])
     for size in (1, 17, 64, 1000):
         monkeypatch.setattr(decimals, "PIECE", size)
         assert np.array_equal(parse_columns(block, ord(","), 3, [2, 1]), whole)
-    assert np.array_equal(whole[:, 0], -np.arange(1000.0))
+    assert np.array_equal(whole[:, 0], -np.arange(300.0))
 
 
 def test_empty_cells_are_nan():

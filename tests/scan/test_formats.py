@@ -230,6 +230,51 @@ def test_a_viewpoint_that_cannot_be_right_leaves_a_cloud(tmp_path):
     assert len(scan) == 41 * 31
 
 
+def ptx(way, ranges, T):
+    """One scan as PTX; way (columns, rows, 3), ranges NaN where nothing came back."""
+    local = np.nan_to_num(way * ranges[..., None]).reshape(-1, 3)
+    lines = [str(way.shape[0]), str(way.shape[1]), " ".join(map(repr, T[:3, 3].tolist()))]
+    lines += [" ".join(map(repr, row)) for row in T[:3, :3].T.tolist()]
+    lines += [" ".join(map(repr, row)) for row in T.T.tolist()]
+    lines += [f"{x!r} {y!r} {z!r} 0.5 10 20 30" for x, y, z in local.tolist()]
+    return "\n".join(lines) + "\n"
+
+
+def test_ptx_keeps_scanner_poses_and_missing_returns(tmp_path):
+    way = spinning(None, np.radians(np.linspace(-20, 20, 41)), np.radians(np.linspace(0, 60, 31)))
+    way = way.transpose(1, 0, 2)
+    rng = np.random.default_rng(0)
+    text, hits, eyes = "", [], []
+    for angle, shift in ((0.3, (458657.0, 5438232.0, 1.5)), (-1.0, (458660.0, 5438230.0, 1.7))):
+        T = np.eye(4)
+        T[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        T[:3, 3] = shift
+        ranges = rng.uniform(2.0, 6.0, way.shape[:2])
+        ranges[:, 18:23] = np.nan
+        text += ptx(way, ranges, T)
+        local = (way * ranges[..., None]).reshape(-1, 3)
+        hits.append(local[np.isfinite(local).all(axis=1)] @ T[:3, :3].T + T[:3, 3])
+        eyes.append(shift)
+    (tmp_path / "s.ptx").write_text(text)
+    scan = read_scan(tmp_path / "s.ptx")
+    assert isinstance(scan, LineScan)
+    assert len(scan.sweeps) == 62
+    assert np.count_nonzero(~scan.returned) == 2 * 31 * 5
+    assert np.allclose(scan.hits, np.concatenate(hits), rtol=0, atol=1e-8)
+    assert np.allclose(np.unique(scan.origins, axis=0), eyes)
+    lines = text.splitlines()
+    for bad, complaint in (
+        (lines[:-1], "cut short"),
+        (lines[:5], "header"),
+        (["x", *lines[1:]], "no header"),
+        ([*lines[:6], "2 0 0 0", *lines[7:]], "not a rigid motion"),
+        ([*lines[:20], "1 2 zwei 0.5 1 2 3", *lines[21:]], "line 21, column z"),
+    ):
+        (tmp_path / "b.ptx").write_text("\n".join(bad) + "\n")
+        with pytest.raises(ScanError, match=complaint):
+            read_scan(tmp_path / "b.ptx")
+
+
 # -- text --------------------------------------------------------------------------------------------
 
 
@@ -298,6 +343,8 @@ def samples(tmp_path, cloud, line_scan):
     open3d.t.io.write_point_cloud(str(tmp_path / "ascii.ply"), tensor, write_ascii=True)
     grid = spinning(np.zeros(3), np.linspace(-0.3, 0.3, 15), np.linspace(0, 1, 12)) * 3.0
     organised(tmp_path, grid, (0, 0, 0), "grid.pcd")
+    way = spinning(None, np.linspace(-0.3, 0.3, 15), np.linspace(0, 1, 12)).transpose(1, 0, 2)
+    (tmp_path / "scan.ptx").write_text(ptx(way, np.full((12, 15), 3.0), np.eye(4)))
     return sorted(tmp_path.iterdir())
 
 
@@ -351,7 +398,7 @@ def test_contents_that_belie_their_name(samples, tmp_path):
             shutil.copy(file, part / f"x{suffix}")
             if suffix == file.suffix or {suffix, file.suffix} <= {".csv", ".xyz"}:
                 continue
-            if file.suffix in (".csv", ".xyz"):
+            if file.suffix in (".csv", ".xyz", ".ptx"):
                 with pytest.raises(ScanError):
                     read_scan(part / f"x{suffix}")
             else:  # these say themselves what they are

@@ -17,6 +17,7 @@ from bimfit.scan.formats.las import read_las
 from bimfit.scan.formats.npz import read_npz, write_npz
 from bimfit.scan.formats.pcd import read_pcd, write_pcd
 from bimfit.scan.formats.ply import read_ply, write_ply
+from bimfit.scan.formats.ptx import read_ptx
 from bimfit.scan.formats.text import first_lines
 from bimfit.scan.formats.xyz import looks_like_points, read_xyz, write_xyz
 
@@ -56,6 +57,7 @@ FORMATS: tuple[Format, ...] = (
     Format("PLY", (".ply",), read_ply, write_ply, (b"ply\n", b"ply\r\n")),
     Format("PCD", (".pcd",), read_pcd, write_pcd, (b"# .PCD", b"VERSION 0.7", b"VERSION .7")),
     Format("LAS", (".las", ".laz"), read_las, None, (b"LASF",)),
+    Format("PTX", (".ptx",), read_ptx),
     Format("XYZ", (".xyz", ".txt", ".pts", ".asc"), read_xyz, write_xyz),
 )
 
