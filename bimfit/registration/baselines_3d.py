@@ -63,21 +63,22 @@ def fpfh_ransac(surface: Surface, scan: Array, T0: Array) -> Array:
         cloud.orient_normals_to_align_with_direction(np.array([0.0, 0.0, 1.0]))
         clouds.append(cloud)
         features.append(pipelines.compute_fpfh_feature(cloud, search))
-    found = pipelines.registration_ransac_based_on_feature_matching(
-        clouds[0],
-        clouds[1],
-        features[0],
-        features[1],
-        True,
-        1.5 * _FEATURE_CELL,
-        pipelines.TransformationEstimationPointToPoint(False),
-        3,
-        [
-            pipelines.CorrespondenceCheckerBasedOnEdgeLength(0.9),
-            pipelines.CorrespondenceCheckerBasedOnDistance(1.5 * _FEATURE_CELL),
-        ],
-        pipelines.RANSACConvergenceCriteria(50_000, 0.999),
-    )
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        found = pipelines.registration_ransac_based_on_feature_matching(
+            clouds[0],
+            clouds[1],
+            features[0],
+            features[1],
+            False,
+            1.5 * _FEATURE_CELL,
+            pipelines.TransformationEstimationPointToPoint(False),
+            3,
+            [
+                pipelines.CorrespondenceCheckerBasedOnEdgeLength(0.9),
+                pipelines.CorrespondenceCheckerBasedOnDistance(1.5 * _FEATURE_CELL),
+            ],
+            pipelines.RANSACConvergenceCriteria(50_000, 0.999),
+        )
     return icp_plane(surface, scan, np.asarray(found.transformation, float))
 
 

@@ -9,7 +9,7 @@ and ranked by what they explain of the cloud.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,9 +24,11 @@ from bimfit.registration.candidates_3d import (
     rotation_candidates,
     thin,
 )
+from bimfit.registration.grcsm_3d import match_3d
 from bimfit.registration.result import MatchResult, Mode
-from bimfit.registration.rigid_3d import Refined, Refiner, parameters_of
+from bimfit.registration.rigid_3d import Refined, Refiner, T_scan_model, parameters_of
 from bimfit.registration.surface_3d import Caster, Surface, visible_surface
+from bimfit.registration.table_3d import Target3D
 
 NO_POSE = np.full(6, np.nan)
 
@@ -52,6 +54,12 @@ class PlacementConfig:
         reaches neither is rejected.
     rival : float
         Another placement that explains more than this share of what the best one does is a rival.
+    blur : float
+        Of the certificate's target, m; about twice the sensor's sigma.
+    window : (float, float)
+        Half widths of the certificate's window, m and rad.
+    time_budget : float or None
+        Of the certificate, s.
     """
 
     sigma: float = 0.001
@@ -62,6 +70,9 @@ class PlacementConfig:
     min_fitness: float = 0.4
     min_coverage: float = 0.4
     rival: float = 0.93
+    blur: float = 0.004
+    window: tuple[float, float] = (0.03, float(np.radians(2.0)))
+    time_budget: float | None = 30.0
 
     def __post_init__(self) -> None:
         if not self.sigma > 0.0:
@@ -87,6 +98,7 @@ def place_cloud(
     viewpoint: ArrayLike | None = None,
     seed: int = 0,
     config: PlacementConfig | None = None,
+    certify: bool = False,
 ) -> MatchResult:
     """Find where the model is in a cloud, from nothing.
 
@@ -101,6 +113,9 @@ def place_cloud(
     seed : int
         Of the thinning of the cloud.
     config : PlacementConfig, optional
+    certify : bool
+        Prove the placement the best within ``config.window`` of it by :func:`grcsm_3d.match_3d`; ``score``,
+        ``bound``, ``evaluations`` and ``stop`` are then the certificate's. Takes seconds.
 
     Returns
     -------
@@ -132,7 +147,52 @@ def place_cloud(
     if eye is not None:
         placed = [_with_view(p, data, normals, mesh, size, settings, eye) for p in placed]
         placed.sort(key=lambda p: -p.score)
-    return _verdict(placed, mesh, len(data), tried, settings, time.perf_counter() - begun)
+    result = _verdict(placed, mesh, tried, settings, time.perf_counter() - begun)
+    return _certified(result, mesh, data, eye, size, settings) if certify and result.found else result
+
+
+def _certified(
+    result: MatchResult,
+    mesh: TriangleMesh,
+    data: Array,
+    eye: Array | None,
+    size: float,
+    settings: PlacementConfig,
+) -> MatchResult:
+    """The placement with the certificate of an exact search around it; the better pose of the two."""
+    prior = T_scan_model(result)
+    back = rigid_inverse(prior)
+    view = None if eye is None else transform_points(back, eye)
+    target = Target3D.of(mesh, max(settings.blur, size / 150.0), viewpoint=view)
+    # What lies far from the model only adds to the search's cost, never to its score.
+    local = transform_points(back, data)
+    margin = settings.window[0] + 3.0 * target.blur
+    near = np.all((local >= mesh.bounds[0] - margin) & (local <= mesh.bounds[1] + margin), axis=1)
+    chosen = data[near][:: max(1, int(near.sum()) // 800)]
+    shift, turn = settings.window
+    step = (0.001,) * 3 + (float(np.radians(0.1)),) * 3
+    proof = match_3d(
+        target, chosen, prior, (shift,) * 3 + (turn,) * 3, step, time_budget=settings.time_budget
+    )
+    if not proof.found:
+        return replace(result, status=proof.status)
+    apart = motion_apart(rigid_inverse(T_scan_model(proof)), back, mesh.vertices)
+    moved = apart > 3.0 * target.blur
+    status = result.status if proof.status.name == "ok" or result.status.name == "ambiguous" else proof.status
+    if moved and result.status.name == "ok":
+        reason = f"an exact search around the placement prefers one {1e3 * apart:.0f} mm away"
+        status = Status("ambiguous", reason)
+    return replace(
+        result,
+        parameters=proof.parameters if moved else result.parameters,
+        modes=(*result.modes, Mode(result.parameters, float("nan"))) if moved else result.modes,
+        score=proof.score,
+        bound=proof.bound,
+        evaluations=proof.evaluations,
+        stop=proof.stop,
+        status=status,
+        seconds=result.seconds + proof.seconds,
+    )
 
 
 def _checked(points: ArrayLike) -> Array:
@@ -268,7 +328,7 @@ def motion_apart(T_a: Array, T_b: Array, model_points: Array) -> float:
 
 
 def _verdict(
-    placed: list[_Placed], mesh: TriangleMesh, n: int, tried: int, settings: PlacementConfig, seconds: float
+    placed: list[_Placed], mesh: TriangleMesh, tried: int, settings: PlacementConfig, seconds: float
 ) -> MatchResult:
     if not placed:
         status = Status("rejected", "no candidate placement of the model was found in the cloud")

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from bimfit.errors import ConfigError, ModelError, ScanError
 from bimfit.geometry.mesh import TriangleMesh
 from bimfit.geometry.pose import rigid_inverse, transform_points
-from bimfit.registration.grcsm_3d import make_problem, match_3d
+from bimfit.registration.grcsm_3d import match_3d
+from bimfit.registration.problem_3d import make_problem
 from bimfit.registration.rigid_3d import T_model_scan, T_scan_model, about, matrix_of, parameters_of
 from bimfit.registration.surface_3d import visible_surface
 from bimfit.registration.table_3d import Target3D
@@ -293,12 +294,16 @@ def test_memory_is_kept_to_by_a_coarser_lattice() -> None:
 
 
 def test_bench_gives_a_row_a_method() -> None:
+    from bimfit.registration.bench_3d import EYE as ABOVE
     from bimfit.registration.bench_3d import bench_matcher_3d, gap_scene
 
     scene = gap_scene()
     assert scene.volume == pytest.approx(2 * 0.2 * 0.025 * 0.5)
     window = (0.004, 0.005)
-    rows = bench_matcher_3d(1, (window,), points=300, methods=("grcsm-3d", "icp-plane", "g-icp"))
+    coarse = Target3D.of(scene, 0.006, viewpoint=ABOVE, spacing=0.005)
+    rows = bench_matcher_3d(
+        1, (window,), points=300, methods=("grcsm-3d", "icp-plane", "g-icp"), target=coarse
+    )
     names = [row.method for row in rows]
     assert names[:2] == ["grcsm-3d", "icp-plane"]
     assert rows[0].failures == 0
