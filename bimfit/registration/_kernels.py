@@ -296,24 +296,28 @@ def merge_blocks(cu, cv, weight, classes, bu, bv, at, lists, counts, slot):
 
 
 @jit
-def bound_box(slot, n, lists, counts, blocks, place, v0, nv, u0, nu, out):
-    """Block bounds of nv x nu neighbouring nodes at one (level, angle).
+def bound_box(slot, n, lists, counts, blocks, place, v0, nv, u0, nu, tally, out):
+    """Block bounds of nv x nu neighbouring nodes at one (level, angle); ``tally`` is scratch.
 
     ``place`` (classes, 5): offset into ``blocks``, rows, columns, lowest block in u and v.
     """
-    for i in range(nv * nu):
-        out[i] = 0
+    tally[: nv * nu] = 0
     for m in range(slot * n, slot * n + counts[slot]):
         where = place[lists[2, m]]
-        weight = np.int64(lists[3, m])
+        weight = lists[3, m]
         x = np.int64(lists[0, m]) + u0 - where[3]
         y = np.int64(lists[1, m]) + v0 - where[4]
         i0, i1 = max(0, -y), min(nv, where[1] - y)
         j0, j1 = max(0, -x), min(nu, where[2] - x)
+        if j0 >= j1:
+            continue
         for i in range(i0, i1):
             line = where[0] + (y + i) * where[2] + x
-            for j in range(j0, j1):
-                out[np.uint64(i * nu + j)] += weight * np.int64(blocks[np.uint64(line + j)])
+            row, sums = blocks[line + j0 : line + j1], tally[i * nu + j0 : i * nu + j1]
+            for j in range(row.shape[0]):
+                sums[j] = np.int32(sums[j] + np.int32(weight * np.int32(row[j])))
+    for i in range(nv * nu):
+        out[i] = tally[i]
 
 
 @jit
@@ -354,8 +358,8 @@ def affine_classes(first, middle, bt, n, cu, cv, class_of, at, out):
 def affine_pass(cu, cv, classes, weight, du, dv, where, tables, at, gu, gv, sums):
     """Sum of majorants at one pose: constants and slopes into ``sums``, weighted slopes a point kept.
 
-    All arrays run over the points; ``where``: offset into ``tables``, rows, columns, rim. Two loops, so
-    that the first becomes vector code.
+    All arrays run over the points; ``where``: offset into ``tables``, rows, columns, rim. Three
+    loops, so that all but the look-ups become vector code.
     """
     offset, rows, columns, pad = where[0], where[1], where[2], where[3]
     right, low, stride = np.int32(columns - 1), np.int32(rows - 1), np.int32(rows * columns)
@@ -364,17 +368,18 @@ def affine_pass(cu, cv, classes, weight, du, dv, where, tables, at, gu, gv, sums
         x = min(max(np.int32(cu[k] + shift_u), np.int32(0)), right)
         y = min(max(np.int32(cv[k] + shift_v), np.int32(0)), low)
         at[k] = np.int32(np.int32(np.int32(y * width) + x) + np.int32(np.int32(classes[k]) * stride))
-    total, total_u, total_v = np.int64(0), np.int64(0), np.int64(0)
     for k in range(cu.shape[0]):
-        word = np.int64(tables[np.uint64(offset + at[k])])
-        w = np.int64(weight[k])
-        a = w * (((word >> 16) & 255) - 128)
-        b = w * ((word >> 24) - 128)
-        total += w * (word & 65535)
-        total_u += a
-        total_v += b
-        gu[k] = np.int32(a)
-        gv[k] = np.int32(b)
+        at[k] = np.int32(tables[np.uint64(offset + at[k])])
+    total, total_u, total_v = np.int64(0), np.int32(0), np.int32(0)
+    for k in range(cu.shape[0]):
+        word, w = at[k], np.int32(weight[k])
+        a = np.int32(w * np.int32(np.int32(np.int32(word >> np.int32(16)) & np.int32(255)) - np.int32(128)))
+        b = np.int32(w * np.int32(np.int32(np.int32(word >> np.int32(24)) & np.int32(255)) - np.int32(128)))
+        total += np.int64(np.int32(w * np.int32(word & np.int32(65535))))
+        total_u = np.int32(total_u + a)
+        total_v = np.int32(total_v + b)
+        gu[k] = a
+        gv[k] = b
     sums[0], sums[1], sums[2] = total, total_u, total_v
 
 
@@ -393,7 +398,7 @@ def turn_gain(cu, cv, other_u, other_v, gu, gv):
 def search(
     options, pu, pv, weight, start, cosine, sine, size, count, lanes, blocks, place, affine, affine_place,
     class_of, classes, slots, prior, prior_at, cu, cv, have, lists, list_counts, near, near_have, at, gu, gv,
-    box, root, keys, codes, found_codes, found_scores, state,
+    tally, box, root, keys, codes, found_codes, found_scores, state,
 ):  # fmt: skip
     """Best-first branch and bound over (theta, v, u); resumable, see ``grcsm.py`` for the arguments."""
     n, first, top = options[0], options[1], options[2]
@@ -427,7 +432,7 @@ def search(
                         cu[own], cv[own], weight, classes[first * n : first * n + n], size[first, 0],
                         size[first, 1], at, lists, list_counts, slot,
                     )  # fmt: skip
-                bound_box(slot, n, lists, list_counts, blocks, place[first], 0, nv, 0, nu, box)
+                bound_box(slot, n, lists, list_counts, blocks, place[first], 0, nv, 0, nu, tally, box)
             for i in range(nv * nu):
                 value = box[i]
                 if has_prior:
@@ -519,10 +524,18 @@ def search(
         t0, v0, u0 = t * bt, v * bv, u * bu  # the node's first leaf
         shift = affine_place[level, 4]
         majorant = shift >= 0
+        steady, slope_u, slope_v, most_u, most_v = (
+            np.int64(0),
+            np.int64(0),
+            np.int64(0),
+            np.int64(0),
+            np.int64(0),
+        )
         if majorant:
             middle = t0 + bt // 2
             for i in range(t0, t0 + bt):
-                ensure_cells(i, n, pu, pv, cosine, sine, start, cu, cv, have)
+                if have[i] == 0:
+                    ensure_cells(i, n, pu, pv, cosine, sine, start, cu, cv, have)
             flag = slots[level] + t
             class_base = affine_place[level, 5] * n
             if near_have[flag] == 0:
@@ -541,6 +554,10 @@ def search(
                 else:
                     there = slice((t0 + i) * n, (t0 + i) * n + n)
                     turns[i] = turn_gain(mu, mv, cu[there], cv[there], gu[:n], gv[:n])
+            steady, slope_u, slope_v = sums[0], sums[1], sums[2]
+            # the most that the slopes add within the node, whichever child
+            most_u = max(-slope_u * (bu // 2), slope_u * (bu - 1 - bu // 2))
+            most_v = max(-slope_v * (bv // 2), slope_v * (bv - 1 - bv // 2))
         best_child, best_key = np.int64(-1), -(np.int64(1) << 60)
         next_t, next_v, next_u = np.int64(0), np.int64(0), np.int64(0)
         for a in range(ft):
@@ -551,14 +568,19 @@ def search(
                 for i in range(1, lt):
                     turn = max(turn, turns[a * lt + i])
                 evaluations += fv * fu
+                if (steady + turn + most_u + most_v) >> shift < cut:
+                    continue  # a log-prior is never positive, so it cannot save the angle
                 if level == 1:
                     # score the rows that hold a leaf whose bound beats the incumbent
-                    ensure_cells(ct, n, pu, pv, cosine, sine, start, cu, cv, have)
                     for b in range(fv):
+                        line = box[b * fu : (b + 1) * fu]
                         worth = False
+                        high = steady + turn + slope_v * (b - bv // 2)
+                        if (high + most_u) >> shift < cut:
+                            line[:] = NOTHING
+                            continue
                         for c in range(fu):
-                            value = sums[0] + turn + sums[2] * (b - bv // 2) + sums[1] * (c - bu // 2)
-                            value = value >> shift
+                            value = (high + slope_u * (c - bu // 2)) >> shift
                             if has_prior:
                                 value += (
                                     prior[prior_at[0, 2] + ct]
@@ -566,7 +588,6 @@ def search(
                                     + prior[prior_at[0, 0] + u0 + c]
                                 )
                             worth = worth or keeps(min(value, bound), pack(ct, v0 + b, u0 + c), cut, cut_code)
-                        line = box[b * fu : (b + 1) * fu]
                         if worth:
                             state[EXPANDED] += 1
                             evaluations += fu
@@ -584,7 +605,18 @@ def search(
                         list_counts, slot,
                     )  # fmt: skip
                 bound_box(
-                    slot, n, lists, list_counts, blocks, place[level - 1], v0 // lv, fv, u0 // lu, fu, box
+                    slot,
+                    n,
+                    lists,
+                    list_counts,
+                    blocks,
+                    place[level - 1],
+                    v0 // lv,
+                    fv,
+                    u0 // lu,
+                    fu,
+                    tally,
+                    box,
                 )
                 evaluations += fv * fu
             if level == 1 and not majorant:
@@ -595,9 +627,9 @@ def search(
                 for c in range(fu):
                     if majorant and level > 1:
                         lo, hi = b * lv - bv // 2, (b + 1) * lv - 1 - bv // 2
-                        value = sums[0] + turn + max(sums[2] * lo, sums[2] * hi)
+                        value = steady + turn + max(slope_v * lo, slope_v * hi)
                         lo, hi = c * lu - bu // 2, (c + 1) * lu - 1 - bu // 2
-                        value = (value + max(sums[1] * lo, sums[1] * hi)) >> shift
+                        value = (value + max(slope_u * lo, slope_u * hi)) >> shift
                     else:
                         value = box[b * fu + c]
                     if has_prior:

@@ -55,7 +55,7 @@ class BenchRow:
 
 
 def time_matches(name: str, jobs: Sequence[Job], config: SearchConfig) -> tuple[list[MatchResult], Array]:
-    """Run one matcher over jobs: results and wall times (s). A match before, not counted, builds the tables."""
+    """Run one matcher over jobs: results and wall times (s). Tables are built before."""
     method = MATCHERS[name]
     for first in {id(job[0]): job for job in jobs}.values():
         method(*first, config)

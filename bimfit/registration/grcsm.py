@@ -20,7 +20,8 @@ from bimfit.registration.result import Stop
 from bimfit.registration.table import BLUR_REACH, Tables, Target
 
 MIN_POINTS = 3
-WEIGHT_STEPS = 255  # unequal weights are rounded to this many steps of the greatest
+WEIGHT_STEPS = 255  # unequal weights are rounded to this many steps of the greatest, or fewer
+MOST_WEIGHT = 300_000  # steps of all points together that the kernels' 32 bits hold
 ROOT_COST = 300_000.0  # look-ups that bounding the whole first level may cost
 TIME_SLICE = 2_000  # evaluations between two looks at the clock
 NOTHING = kernels.NOTHING
@@ -116,6 +117,8 @@ def pose_problem(
 
 
 def _weights(weights: ArrayLike | None, n: int) -> tuple[NDArray[np.uint64], float, float]:
+    if n > MOST_WEIGHT:
+        raise ConfigError(f"{n} points in one slice are too many", remedy="thin the scan or the slices")
     if weights is None:
         return _UNIT, 1.0 / kernels.FULL, 0.5 * n / kernels.FULL
     values = np.asarray(weights, float)
@@ -124,9 +127,10 @@ def _weights(weights: ArrayLike | None, n: int) -> tuple[NDArray[np.uint64], flo
     top = float(values.max(initial=0.0))
     if top == 0.0:
         raise ConfigError("all weights are 0")
-    whole = np.rint(values * (WEIGHT_STEPS / top))
-    rounding = float(0.5 * values.sum() / kernels.FULL + 0.5 * n * top / WEIGHT_STEPS)
-    return whole.astype(np.uint64), top / (WEIGHT_STEPS * kernels.FULL), rounding
+    steps = max(1, min(WEIGHT_STEPS, MOST_WEIGHT // max(n, 1)))
+    whole = np.rint(values * (steps / top))
+    rounding = float(0.5 * values.sum() / kernels.FULL + 0.5 * n * top / steps)
+    return whole.astype(np.uint64), top / (steps * kernels.FULL), rounding
 
 
 def prior_table(config: SearchConfig, lattice: Lattice, unit: float) -> tuple[Integers, Integers, bool]:
@@ -191,6 +195,7 @@ class Workspace:
         self.near = np.empty(max(1, plan.near) * n, np.uint8)
         self.at, self.gu, self.gv = (np.empty(2 * n, np.int32) for _ in range(3))
         self.box = np.empty(max(wide, plan.fan) + 4, np.int64)
+        self.tally = np.empty(len(self.box), np.int32)
         self.root = np.empty(plan.roots, np.int64)
         self.keys = np.empty(plan.roots + (lattice.top + 2) * plan.fan + 1024, np.int64)
         self.codes = np.empty_like(self.keys)
@@ -281,7 +286,7 @@ def run(
             lattice.size, lattice.nodes, tables.lanes, tables.blocks, tables.block_place, tables.affine,
             tables.affine_place, tables.class_of, work.classes, plan.slots, prior, prior_at, work.cu, work.cv,
             work.have, work.lists, work.list_counts, work.near, work.near_have, work.at, work.gu, work.gv,
-            work.box, work.root, work.keys, work.codes, work.found, work.values, state,
+            work.tally, work.box, work.root, work.keys, work.codes, work.found, work.values, state,
         )  # fmt: skip
         if ended == kernels.HEAP_FULL:
             work.grow("keys", "codes")

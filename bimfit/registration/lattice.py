@@ -109,7 +109,7 @@ class Lattice:
     @cached_property
     def angles(self) -> Array:
         """Every angle of the lattice, rad."""
-        return self.first[2] + self.step[2] * np.arange(self.count[2])
+        return np.asarray(self.first[2] + self.step[2] * np.arange(self.count[2]), np.float64)
 
     @cached_property
     def half_angle(self) -> Array:

@@ -18,10 +18,9 @@ def test_rows_agree_with_one_another(scenes):
     slices, truth = [m[0] for m in made], [m[1] for m in made]
     target = Target.of(scenes.boards_edges(), 0.006)
     starts = [Pose2D(1.0, 0.0, 0.0)] * 4  # a metre off: ICP has nothing to match
-    rows = {r.name: r for r in bench_methods(
-        target, slices, SMALL, ("grcsm", "overlap", "block", "icp-point", "brute"), starts=starts, truth=truth,
-        most={"brute": 2},
-    )}  # fmt: skip
+    methods = ("grcsm", "overlap", "block", "icp-point", "brute")
+    made_rows = bench_methods(target, slices, SMALL, methods, starts=starts, truth=truth, most={"brute": 2})
+    rows = {r.name: r for r in made_rows}
     assert all(rows[name].missed == 0.0 for name in ("grcsm", "overlap", "brute"))
     assert 0.0 <= rows["block"].missed <= 1.0 and rows["block"].proven == 0.0
     assert rows["brute"].slices == 2 and rows["brute"].evaluations == 27**3

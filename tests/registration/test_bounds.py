@@ -117,9 +117,8 @@ def test_no_node_holds_a_leaf_above_its_bound(seed_, shape, kind, weighted):
             )
             own = classes[level * n : level * n + n]
             kernels.merge_blocks(cu, cv, problem.weight, own, bu, bv, at, lists, counts, 0)
-            kernels.bound_box(
-                0, n, lists, counts, tables.blocks, tables.block_place[level], 0, nv, 0, nu, out
-            )
+            tally, where = np.empty(nv * nu, np.int32), tables.block_place[level]
+            kernels.bound_box(0, n, lists, counts, tables.blocks, where, 0, nv, 0, nu, tally, out)
             assert np.all(out.reshape(nv, nu) >= most[t])
 
 
