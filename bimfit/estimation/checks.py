@@ -27,6 +27,7 @@ _CHI2 = 4.0
 _CONTINUES = 4
 _EDGE = 3.5
 _BY_CHANCE = 0.05
+_FIXED_BY_HITS = 0.001
 _TURNED = 3.0
 
 
@@ -127,8 +128,9 @@ def judge_station(
         worse = status.measured if not c.status.measured else status.name == "ok"
         if c.status.name != "ok" and worse:
             status = Status(c.status.name, f"component {name}: {c.status.reason}")
-    if status.name == "ok" and reason:
-        status = Status("weak", reason)
+    loose = [p is None or p.weak_sd_ranges > _FIXED_BY_HITS for p in posteriors]
+    if status.name == "ok" and reason and any(loose):
+        status = Status("weak", f"not fixed across the gap (u): {reason}")
     return StationEstimate(
         s,
         slid.pose,
@@ -158,7 +160,7 @@ def _component(
 ) -> ComponentEstimate:  # fmt: skip
     if posterior is None:
         return ComponentEstimate(status=Status("no_data", "hardly any return lies on the component"))
-    status, weak = _component_status(posterior, residuals, prior, window, fit)
+    status, weak = _component_status(posterior, residuals, prior, window, fit, sensor.miss_share)
     rivals: tuple[Rival, ...] = ()
     return ComponentEstimate(
         posterior.pose, posterior.covariance, status, rivals, residuals.n_inliers, residuals.rms, weak,
@@ -167,7 +169,7 @@ def _component(
 
 
 def _component_status(
-    posterior: Posterior, r: Residuals, prior: Pose2D, window: Window, fit: FitConfig
+    posterior: Posterior, r: Residuals, prior: Pose2D, window: Window, fit: FitConfig, miss_share: float
 ) -> tuple[Status, str]:
     """Verdict on one component, and the name of its weak direction."""
     pivot = posterior.pivot
@@ -178,7 +180,9 @@ def _component_status(
     if r.n_inliers < _INLIERS * r.n_covered:
         share = f"{r.n_inliers} of the {r.n_covered} beams that should meet the component"
         return Status("rejected", f"only {share} return from it"), ""
-    if max(r.miss_run, r.outlier_run) >= _RUN:
+    # the longest run of chance misses among so many beams is seldom longer than this
+    chance = math.log(1e-3 / max(r.n_covered, 1)) / math.log(max(miss_share, 0.05))
+    if max(r.miss_run, r.outlier_run) >= max(_RUN, chance):
         what = "return nothing" if r.miss_run >= r.outlier_run else "return from elsewhere"
         run = max(r.miss_run, r.outlier_run)
         return Status("rejected", f"{run} beams in a row that should meet the component {what}"), ""

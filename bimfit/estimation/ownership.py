@@ -182,7 +182,7 @@ def second_round(
     return use, replace(cost, off=off, limit=other + 3.0 * sigma)
 
 
-def through(corners: tuple[Array, Array], beams: BeamSet, depth: float) -> int:
+def through(corners: tuple[Array, Array], beams: BeamSet, nearest: Array, depth: float, sigma: float) -> int:
     """How many beams went in between the two mouth corners: missing, or back from deeper than the mouth.
 
     Parameters
@@ -191,6 +191,10 @@ def through(corners: tuple[Array, Array], beams: BeamSet, depth: float) -> int:
         Mouth corners of A and B as built.
     depth : float
         A return that much farther than the corners went past them, m.
+    nearest : ndarray, shape (n,)
+        Predicted range to either component: a return from a groove's own face went in as well.
+    sigma : float
+        Standard deviation of a range, m.
 
     Returns
     -------
@@ -212,7 +216,8 @@ def through(corners: tuple[Array, Array], beams: BeamSet, depth: float) -> int:
         step = 0.5 * float(np.median(np.diff(p)))
         lo, hi = np.searchsorted(p, (min(bearing) - step, max(bearing) + step))
         r = beams.r[s + lo : s + hi]
-        passed += int(((r < 0.0) | (r > level + depth)).sum())
+        own = (np.abs(r - nearest[s + lo : s + hi]) < 4.0 * sigma) & (r > level + 2.0 * sigma)
+        passed += int(((r < 0.0) | (r > level + depth) | own).sum())
         between += len(r)
     return passed if 2 * passed >= between else 0
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from bimfit.config import FitConfig, SensorConfig
 from bimfit.estimation import checks
-from bimfit.estimation.cloud import virtual_beams
+from bimfit.estimation.cloud import irregular_sensor, virtual_beams
 from bimfit.estimation.likelihood import BeamModel, BeamSet, edge_rows, predict_ranges
 from bimfit.estimation.ownership import (
     Cost,
@@ -99,7 +99,7 @@ def estimate_station(
         virtual = virtual_beams(slice_, section, combined, sensor)
         beams = BeamSet.of(virtual.beams)
         if not virtual.spacing_known:
-            sensor = dataclasses.replace(sensor, missing_means_gap=False)
+            sensor = irregular_sensor(sensor)
     else:
         beams = BeamSet.of(slice_.beams)
     rows = (edge_rows(section.components[0]), edge_rows(section.components[1]))
@@ -144,10 +144,10 @@ def _depth(context: _Context) -> float:
     return max(4.0 * context.sensor.sigma, 1.5 * context.fit.placement_sigma)
 
 
-def _through(context: _Context, poses: Sequence[Pose2D]) -> int:
+def _through(context: _Context, poses: Sequence[Pose2D], scene: Scene) -> int:
     """Beams that went in between the components' mouth corners."""
     a, b = (pose.apply(m) for pose, m in zip(poses, context.section.gap.mouth, strict=True))
-    return through((a, b), context.beams, _depth(context))
+    return through((a, b), context.beams, scene.nearest, _depth(context), context.sensor.sigma)
 
 
 def _usable(context: _Context, scene: Scene, side: Ints, pose: Pose2D) -> Mask:
@@ -197,7 +197,7 @@ def _components(
     posteriors = first
     poses = [p.pose if p is not None else pose for p in posteriors]
     scene = _scene(context, poses)
-    passed = _through(context, poses)
+    passed = _through(context, poses, scene)
     both = np.isfinite(scene.rho[0]) & np.isfinite(scene.rho[1])
     if all(p is not None for p in first) and (bool(np.any(both & usable)) or passed < _FEW_THROUGH):
         posteriors = list(first)
@@ -206,7 +206,9 @@ def _components(
             posteriors[which] = _one(context, which, pose, use & usable, spent, window, poses[which])
             poses[which] = posteriors[which].pose if posteriors[which] is not None else pose  # type: ignore[union-attr]
             scene = _scene(context, poses)
-        passed = _through(context, poses)
+        passed = _through(context, poses, scene)
+    if reason:
+        posteriors = [p if p is None else _loosened(context, p) for p in posteriors]
     residuals = [
         _residuals(context, which, scene, side, usable) if posteriors[which] is not None else Residuals()
         for which in (0, 1)
@@ -216,6 +218,21 @@ def _components(
         slice_.s, context.section, slid, (posteriors[0], posteriors[1]), (residuals[0], residuals[1]),
         (steps[0], steps[1]), window, context.sensor, context.fit, passed, reason, context.virtual,
     )  # fmt: skip
+
+
+def _loosened(context: _Context, p: Posterior) -> Posterior:
+    """Points at random end up to two of their spacings, or of their noise, from an edge (see cloud.py)."""
+    if p.weak_sd_ranges < context.sensor.sigma:
+        return p
+    reach = float(np.hypot(*(p.pivot - context.beams.eye[0, :2])))
+    sd = 2.0 * max(context.sensor.sigma, context.beams.spacing * reach)
+    wider = np.diag([sd * sd, 0.0, 0.0])
+    return dataclasses.replace(
+        p,
+        covariance=p.covariance + wider,
+        pivot_covariance=p.pivot_covariance + wider,
+        weak_sd=math.hypot(p.weak_sd, sd * abs(float(p.weak_axis[0]))),
+    )
 
 
 def _corner_step(context: _Context, which: int, pose: Pose2D) -> float:
