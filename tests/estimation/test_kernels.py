@@ -1,0 +1,220 @@
+"""The kernels against independent oracles: shapely, closed forms, a dense lattice, and their own Python."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import shapely
+
+from bimfit.config import SensorConfig
+from bimfit.estimation import _kernels
+from bimfit.estimation.likelihood import BeamModel, BeamSet, edge_rows, predict_ranges
+from bimfit.estimation.ownership import Cost
+from bimfit.estimation.posterior import Window, component_posterior
+from bimfit.geometry.pose import Pose2D
+from bimfit.geometry.profile import Profile
+from bimfit.geometry.slice import Beams
+
+STEP = 0.352 * np.pi / 180
+BOARD = Profile.polygon([(0.0125, 0.0), (0.0125, -0.025), (0.2125, -0.025), (0.2125, 0.0)])
+NOTCHED = Profile.polygon(
+    [(-0.2, -0.03), (-0.01, -0.03), (-0.01, -0.01), (-0.05, -0.02), (-0.06, 0.0), (-0.12, 0.01), (-0.2, 0.0)]
+)
+
+
+def _fan(eye, half=85, step=STEP, look=-np.pi / 2, ranges=None):
+    angle = look + step * np.arange(-half, half + 1)
+    d = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    r = np.full(len(d), np.nan) if ranges is None else ranges
+    return Beams(np.broadcast_to(np.asarray(eye, float), d.shape).copy(), d, r)
+
+
+def _shapely_ranges(profile, beams):
+    body = shapely.Polygon(profile.loops[0], profile.loops[1:])
+    out = np.full(len(beams.ranges), np.inf)
+    for k, (o, d) in enumerate(zip(beams.origins, beams.directions, strict=True)):
+        hit = shapely.LineString([o, o + 5.0 * d]).intersection(body)
+        if not hit.is_empty:
+            out[k] = shapely.Point(o).distance(hit)
+    return out
+
+
+@pytest.mark.parametrize("profile", [BOARD, NOTCHED, BOARD.moved(Pose2D(0.01, -0.02, 0.3))])
+@pytest.mark.parametrize("eye", [(0.0, 0.25), (-0.3, 0.1), (0.05, -0.3)])
+def test_predicted_ranges_are_the_first_intersections(profile, eye):
+    look = math.atan2(-eye[1], -eye[0])
+    beams = _fan(eye, look=look)
+    set_ = BeamSet.of(beams)
+    rho, face = predict_ranges(edge_rows(profile), set_)
+    exact = _shapely_ranges(profile, beams)[set_.order]
+    assert np.array_equal(np.isfinite(rho), np.isfinite(exact))
+    seen = np.isfinite(rho)
+    assert seen.any()
+    assert np.allclose(rho[seen], exact[seen], atol=1e-9)
+    assert np.array_equal(face >= 0, seen)
+
+
+def test_all_round_scans_and_several_origins_are_predicted_too():
+    ring = Profile.polygon(
+        [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)],
+        holes=[[(-0.4, -0.4), (0.4, -0.4), (0.4, 0.4), (-0.4, 0.4)]],
+    )
+    rng = np.random.default_rng(2)
+    angle = rng.uniform(-np.pi, np.pi, 400)
+    d = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    o = np.array([(0.0, 0.0), (0.2, -0.1), (-0.3, 0.3)])[rng.integers(0, 3, 400)]
+    beams = Beams(o, d, np.full(400, np.nan))
+    set_ = BeamSet.of(beams)
+    rho, _ = predict_ranges(edge_rows(ring), set_)
+    assert len(set_.eye) == 3
+    assert np.allclose(rho, _shapely_ranges(ring, beams)[set_.order], atol=1e-9)
+
+
+def test_pseudo_angle_sorts_like_atan2():
+    a = np.sort(np.random.default_rng(0).uniform(-np.pi, np.pi, 500))
+    p = np.array([_kernels.pseudo_angle(math.cos(x), math.sin(x)) for x in a])
+    assert np.all(np.diff(p) > 0)
+    assert p.min() >= -2.0
+    assert p.max() <= 2.0
+
+
+HOME = Pose2D()
+
+
+def _seen(pose=HOME, sigma=0.003, seed=1, profile=BOARD):
+    """A board from 0.25 m above, right half of the fan, as the posterior takes it."""
+    beams = _fan((0.0, 0.25))
+    rng = np.random.default_rng(seed)
+    rho = _shapely_ranges(profile.moved(pose), beams)
+    r = np.where(np.isfinite(rho), rho + rng.normal(0.0, sigma, len(rho)), np.nan)
+    set_ = BeamSet.of(Beams(beams.origins, beams.directions, r))
+    set_ = set_.take(set_.d[0] > 0.0)
+    model = BeamModel.of(SensorConfig(sigma=sigma))
+    n = len(set_)
+    cost = Cost(np.where(set_.r < 0.0, model.miss, 0.0), np.zeros(n), 1.0, np.full(n, np.inf))
+    return set_, model, cost
+
+
+def test_information_of_a_flat_face_is_the_closed_form():
+    """METHOD section 5: g = [cos a / cos b, sin a / cos b, rho tan b], I = sum g g^T / sigma^2."""
+    set_, model, cost = _seen(sigma=1e-4)
+    rho, face = predict_ranges(edge_rows(BOARD), set_)
+    top = (face == 3) & (set_.r > 0.0)
+    phi = np.arctan2(set_.d[1], set_.d[0])[top]
+    alpha = -np.pi / 2  # the face's normal, towards the material as the beam goes
+    beta = alpha - phi
+    g = np.stack(
+        [np.cos(alpha) / np.cos(beta), np.sin(alpha) / np.cos(beta), rho[top] * np.tan(beta)], axis=1
+    )
+    expected = g.T @ g / model.sigma**2
+    n = len(set_)
+    H, b = np.empty((3, 3)), np.empty(3)
+    # rotation about the sensor, as the closed form has it
+    local = set_.moved_origin(np.array([0.0, 0.25]))
+    rows = edge_rows(BOARD, Pose2D(0.0, -0.25, 0.0))
+    _kernels.normal_equations(
+        rows, np.zeros(3), 1.0, local.p, local.d, np.where(top, rho, -1e9), local.start, local.eye,
+        cost.limit, model.sigma, 0.0, 1 << 40, 0.0, model.table, model.scale, np.empty(n),
+        np.empty(n, np.int64), H, b,
+    )  # fmt: skip
+    assert np.allclose(np.abs(H), np.abs(expected), rtol=1e-3, atol=1e-3 * np.abs(expected).max())
+    assert np.allclose(np.diag(H), np.diag(expected), rtol=1e-3)
+
+
+def _lattice(rows, pivot, radius, set_, model, cost, window, around, half, n=41):
+    """Mean and covariance by brute force over a dense lattice of (u, v, theta) about the pivot."""
+    grid = [np.linspace(m - h, m + h, n) for m, h in zip(around, half, strict=True)]
+    X = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1).reshape(-1, 3)
+    local = set_.moved_origin(pivot)
+    moved = rows.copy()
+    moved[:, 0:2] -= pivot
+    moved[:, 2:4] -= pivot
+    rho, face = np.empty(len(set_)), np.empty(len(set_), np.int64)
+    spread = (0.05 * set_.spacing / model.sigma) ** 2
+    before = (local.p, local.d, local.r, local.start, local.eye, cost.off, cost.deep, cost.margin, cost.limit)
+    after = (model.sigma, spread, model.table, model.scale, rho, face)
+    value = np.array([_kernels.log_likelihood(moved, x, *before, *after) for x in X])
+    value -= 0.5 * np.sum((X / (window.shift, window.shift, window.angle)) ** 2, axis=1)
+    w = np.exp(value - value.max())
+    w /= w.sum()
+    mean = w @ X
+    return mean, (X - mean).T @ ((X - mean) * w[:, None])
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_quadrature_agrees_with_a_dense_lattice(seed):
+    truth = Pose2D.about((0.0125, 0.0), 0.002, -0.003, math.radians(1.5))
+    set_, model, cost = _seen(truth, seed=seed)
+    points = set_.points[set_.r > 0.0]
+    window = Window()
+    rows = edge_rows(BOARD)
+    result = component_posterior(rows, Pose2D(), set_, cost, points, model, window)
+    sd = np.sqrt(np.diag(result.pivot_covariance))
+    delta = np.array([*(result.pose.apply(result.pivot) - result.pivot), result.pose.theta])
+    mean, cov = _lattice(
+        rows, result.pivot, result.radius, set_, model, cost, window, delta, 4.5 * sd + (4e-4, 0.0, 0.0)
+    )
+    assert np.all(np.abs(mean - delta) < 0.15 * sd)
+    assert np.allclose(np.sqrt(np.diag(cov)), sd, rtol=0.12)
+
+
+def test_posterior_does_not_depend_on_where_the_frame_is():
+    set_, model, cost = _seen(Pose2D(0.001, 0.002, 0.01))
+    points = set_.points[set_.r > 0.0]
+    one = component_posterior(edge_rows(BOARD), Pose2D(), set_, cost, points, model, Window())
+    shift = np.array([3.0, -7.0])
+    far = set_.moved_origin(-shift)
+    rows = edge_rows(BOARD.moved(Pose2D(*shift, 0.0)))
+    two = component_posterior(rows, Pose2D(), far, cost, points + shift, model, Window())
+    corner = np.array([0.0125, 0.0])
+    assert np.allclose(two.pose.apply(corner + shift) - shift, one.pose.apply(corner), atol=1e-8)
+    J = np.eye(3)
+    arm = two.pose.turn(shift)
+    J[0, 2], J[1, 2] = -arm[1], arm[0]
+    assert np.allclose(J @ two.covariance @ J.T, one.covariance, rtol=1e-4, atol=1e-12)
+
+
+def test_kernels_do_what_their_python_does():
+    set_, model, cost = _seen(Pose2D(0.001, 0.002, 0.01))
+    rows = edge_rows(BOARD)
+    n = len(set_)
+    rho, face = np.full(n, np.inf), np.full(n, -1, np.int64)
+    args = (rows, math.cos(0.02), math.sin(0.02), 1e-3, -2e-3, set_.p, set_.d, set_.start, set_.eye)
+    _kernels.predict(*args, rho, face)
+    slow, slow_face = np.full(n, np.inf), np.full(n, -1, np.int64)
+    _kernels.predict.py_func(*args, slow, slow_face)
+    assert np.array_equal(face, slow_face)
+    assert np.allclose(rho[face >= 0], slow[face >= 0], rtol=1e-12)
+    beams = (set_.p, set_.d, set_.r, set_.start, set_.eye, cost.off, cost.deep, cost.margin, cost.limit)
+    common = (rows, np.array([1e-3, -2e-3, 0.02]), *beams, model.sigma, 0.1, model.table, model.scale)
+    fast = _kernels.log_likelihood(*common, rho, face)
+    assert fast == pytest.approx(_kernels.log_likelihood.py_func(*common, rho, face), rel=1e-12)
+    covered = face >= 0
+    d2 = ((set_.r - rho) / model.sigma) ** 2
+    a = model.amplitude * np.exp(-0.5 * d2)
+    naive = np.sum(np.where(covered, np.log1p(a) + cost.off, 0.0))
+    flat = _kernels.log_likelihood(*common[:12], 0.0, *common[13:], rho, face)
+    assert flat == pytest.approx(naive, abs=0.3)
+
+
+def test_a_return_from_behind_counts_only_where_something_should_have_stopped_it():
+    set_, model, _ = _seen()
+    n = len(set_)
+    rows = edge_rows(BOARD)
+    rho, face = predict_ranges(rows, set_)
+    covered = face >= 0
+    behind = np.where(np.isfinite(rho), rho + 0.1, 0.6)
+    common = (set_.p, set_.d, behind, set_.start, set_.eye, np.zeros(n), np.full(n, model.past), 0.012)
+    tail = (
+        np.full(n, np.inf),
+        model.sigma,
+        0.0,
+        model.table,
+        model.scale,
+        np.empty(n),
+        np.empty(n, np.int64),
+    )
+    total = _kernels.log_likelihood(rows, np.zeros(3), *common, *tail)
+    assert total == pytest.approx(model.past * covered.sum(), rel=1e-9)
