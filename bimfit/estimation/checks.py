@@ -61,7 +61,7 @@ def residuals_of(beams: BeamSet, rho: Array, face: NDArray[np.int64], used: Mask
         miss_share=float((~returned).sum() / n) if n else 0.0,
         outlier_run=longest_run(returned & ~inlier),
         miss_run=longest_run(~returned),
-        cusum=float((walk.max() - walk.min()) / max(float(z.std()), 1e-9) / math.sqrt(k)) if k > 3 else 0.0,
+        cusum=float((walk.max() - walk.min()) / max(float(z.std()), sigma) / math.sqrt(k)) if k > 3 else 0.0,
         lag1=lag,
         unexplained=_continues(beams, rho, covered, used, sigma),
         edge=_edge_drop(z, face[covered][inlier], sigma),
