@@ -20,6 +20,7 @@ from bimfit.geometry.status import OK, Status
 Mask = NDArray[np.bool_]
 _RIVAL_ODDS = -4.0
 _RIVAL_MASS = 0.2
+_WORTH_NAMING = 0.01
 _INLIERS = 0.5
 _RUN = 6
 _CUSUM = 2.3
@@ -162,6 +163,11 @@ def _component(
         return ComponentEstimate(status=Status("no_data", "hardly any return lies on the component"))
     status, weak = _component_status(posterior, residuals, prior, window, fit, sensor.miss_share)
     rivals: tuple[Rival, ...] = ()
+    if posterior.rival_mass > _WORTH_NAMING:
+        du, dv = posterior.rival_offset * posterior.weak_axis[:2]
+        there = Pose2D(posterior.pose.u + float(du), posterior.pose.v + float(dv), posterior.pose.theta)
+        mass = min(posterior.rival_mass, 0.999)
+        rivals = (Rival(there, math.log(mass / (1.0 - mass))),)
     return ComponentEstimate(
         posterior.pose, posterior.covariance, status, rivals, residuals.n_inliers, residuals.rms, weak,
         posterior, residuals, prior, (window.shift, window.shift, window.angle),

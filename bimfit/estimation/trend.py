@@ -6,7 +6,7 @@ x = (u, v, theta). Stations enter by what their ranges say alone: precision L_i 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -240,8 +240,3 @@ class Evidence:
         beta = cho_solve_banded((factor, True), self.right, check_finite=False)
         prior = -2.0 * (self.n - 2) * np.log(roughness[0]) - (self.n - 2) * np.log(roughness[1])
         return float(0.5 * self.right @ beta - np.log(factor[0]).sum() + prior)
-
-
-def only(sites: Sites, keep: Mask) -> Sites:
-    """The sites with the others' precision set to nothing."""
-    return replace(sites, precision=np.where(keep[:, None, None], sites.precision, 0.0))
