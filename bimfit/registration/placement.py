@@ -51,7 +51,9 @@ class PlacementConfig:
         Candidates refined to the end.
     min_fitness, min_coverage : float
         Share of the cloud explained, and of the model's visible surface covered; a placement that
-        reaches neither is rejected.
+        reaches neither is rejected, unless
+    min_purity : float
+        this share is explained of the points in the model's own box, and they fix all six directions.
     rival : float
         Another placement that explains more than this share of what the best one does is a rival.
     blur : float
@@ -69,6 +71,7 @@ class PlacementConfig:
     refined: int = 8
     min_fitness: float = 0.4
     min_coverage: float = 0.4
+    min_purity: float = 0.7
     rival: float = 0.93
     blur: float = 0.004
     window: tuple[float, float] = (0.03, float(np.radians(2.0)))
@@ -83,12 +86,13 @@ class PlacementConfig:
 
 @dataclass(frozen=True)
 class _Placed:
-    """One refined candidate."""
+    """One refined candidate; ``purity`` is the share explained of the points in the model's own box."""
 
     refined: Refined
     score: float
     fitness: float
     coverage: float
+    purity: float
 
 
 def place_cloud(
@@ -255,7 +259,10 @@ def _refine_all(
         rough.append((float(judged.inlier.sum()), first.T))
     rough.sort(key=lambda pair: -pair[0])
     chosen: list[Array] = []
-    for _, T in rough:
+    for count, T in rough:
+        # Far behind the best after a rough fit: no finish makes a rival of it.
+        if count < 0.6 * rough[0][0]:
+            break
         if all(motion_apart(T, other, surface.points) > 0.03 * size for other in chosen):
             chosen.append(T)
         if len(chosen) == settings.refined:
@@ -276,9 +283,13 @@ def _finish(
     gates = (size / 24.0, size / 48.0, size / 96.0)
     result = refiner.refine(data, T, gates=gates, floor=settings.sigma, normals=normals)
     judged = refiner.judge(data, result.T, max(result.sigma, size / 500.0), normals)
-    coverage = _coverage(refiner.surface, transform_points(result.T, data), size)
+    moved = transform_points(result.T, data)
+    coverage = _coverage(refiner.surface, moved, size)
     inliers = float(judged.inlier.sum())
-    return _Placed(result, inliers, inliers / len(data), coverage)
+    low, high = refiner.surface.points.min(axis=0), refiner.surface.points.max(axis=0)
+    within = np.all((moved > low - 0.02 * size) & (moved < high + 0.02 * size), axis=1)
+    purity = inliers / max(float(within.sum()), 1.0)
+    return _Placed(result, inliers, inliers / len(data), coverage, purity)
 
 
 def _with_view(
@@ -297,7 +308,7 @@ def _with_view(
     through = points_behind(
         mesh, transform_points(again.refined.T, data), transform_points(again.refined.T, eye), size
     )
-    return _Placed(again.refined, again.score - through, again.fitness, again.coverage)
+    return _Placed(again.refined, again.score - through, again.fitness, again.coverage, again.purity)
 
 
 def points_behind(mesh: TriangleMesh, points: Array, eye: Array, size: float) -> int:
@@ -357,7 +368,10 @@ def _verdict(
 
 
 def _status(best: _Placed, rivals: list[_Placed], settings: PlacementConfig) -> Status:
-    if best.fitness < settings.min_fitness and best.coverage < settings.min_coverage:
+    names = best.refined.information.names()
+    # Amid a large scene a model seen from one side reaches neither share, but is alone in its own box.
+    alone = best.purity >= settings.min_purity and not names and best.coverage >= 0.6 * settings.min_coverage
+    if best.fitness < settings.min_fitness and best.coverage < settings.min_coverage and not alone:
         return Status(
             "rejected",
             f"the best placement explains {best.fitness:.0%} of the cloud and covers"
@@ -368,7 +382,6 @@ def _status(best: _Placed, rivals: list[_Placed], settings: PlacementConfig) -> 
         return Status(
             "ambiguous", f"{len(rivals)} other placement(s) explain about as much of the cloud: {shares}"
         )
-    names = best.refined.information.names()
     if names:
         return Status("weak", "the cloud does not fix: " + ", ".join(names))
     return OK

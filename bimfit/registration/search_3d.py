@@ -6,7 +6,6 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import qmc
 
 from bimfit.geometry.pose import Array
 from bimfit.registration import _kernels_3d as kernels
@@ -33,6 +32,8 @@ class Outcome3D:
 
 def incumbent(problem: Problem3D, limit: float) -> tuple[Array, float, int]:
     """Climb from the window's middle and from a few points spread over it: (at, score, evaluations)."""
+    from scipy.stats import qmc
+
     d = len(problem.steps)
     if not d:
         return np.zeros(0), problem.score(problem.x0), 1

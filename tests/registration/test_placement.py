@@ -125,12 +125,12 @@ def test_names_the_directions_that_a_single_face_leaves_open() -> None:
         assert result.modes
 
 
-@pytest.mark.parametrize("kind", ["noise", "sphere"])
+@pytest.mark.parametrize("kind", ["noise", "room"])
 def test_rejects_what_is_not_there(kind: str) -> None:
     rng = np.random.default_rng(6)
     cloud = rng.uniform(-0.6, 0.6, (1500, 3))
-    if kind == "sphere":
-        cloud = 0.8 * cloud / np.linalg.norm(cloud, axis=1, keepdims=True)
+    if kind == "room":  # a floor and two walls, nothing on them
+        cloud[:700, 2], cloud[700:1100, 0], cloud[1100:, 1] = -0.6, 0.6, 0.6
     result = place_cloud(cloud, bracket(), config=PlacementConfig(max_rotations=24))
     assert result.status.name == "rejected"
     assert "explains" in result.status.reason
@@ -210,7 +210,7 @@ def test_certifies_a_placement() -> None:
     rng = np.random.default_rng(11)
     mesh, eye = bracket(), np.array([0.7, -0.9, 0.8])
     truth = random_pose(rng)
-    config = PlacementConfig(blur=0.008, window=(0.01, 0.01))
+    config = PlacementConfig(blur=0.012, window=(0.01, 0.01))
     known = transform_points(truth, eye)
     result = place_cloud(
         scan_of(mesh, eye, truth, rng, count=1000), mesh, viewpoint=known, config=config, certify=True
