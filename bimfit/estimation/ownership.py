@@ -160,12 +160,12 @@ def first_round(which: int, scene: Scene, side: Ints) -> Mask:
 
 
 def second_round(
-    which: int, scene: Scene, side: Ints, beams: BeamSet, cost: Cost, model: BeamModel, *, territory: bool
+    which: int, scene: Scene, side: Ints, beams: BeamSet, cost: Cost, model: BeamModel, *, territory: Mask
 ) -> tuple[Mask, Cost]:
     """The same when the other component has been estimated.
 
-    Returns that the other explains count for it; with ``territory`` they may not be claimed even by a
-    surface that would explain them equally well, for two bodies do not fill the same place.
+    Returns that the other explains count for it; those in its ``territory`` (n,) may not be claimed even by
+    a surface that would explain them equally well, for two bodies do not fill the same place.
     """
     other = scene.rho[1 - which]
     sigma = float(np.hypot(model.sigma, 0.001))
@@ -177,8 +177,7 @@ def second_round(
     off = cost.off - np.where(claimed, odds, 0.0)
     # a beam that the other should have returned speaks for neither when it did not
     off = np.where((beams.r < 0.0) & np.isfinite(other), 0.0, off)
-    if territory:
-        off = off - np.where(foreign, abs(model.past), 0.0)
+    off = off - np.where(foreign & territory, abs(model.past), 0.0)
     return use, replace(cost, off=off, limit=other + 3.0 * sigma)
 
 
@@ -220,6 +219,14 @@ def through(corners: tuple[Array, Array], beams: BeamSet, nearest: Array, depth:
         passed += int(((r < 0.0) | (r > level + depth) | own).sum())
         between += len(r)
     return passed if 2 * passed >= between else 0
+
+
+def meeting(scene: Scene, few: int) -> bool:
+    """Whether fewer than ``few`` open beams part A from B somewhere, as in a groove closed at its root."""
+    owner = scene.owner
+    seen = np.flatnonzero(owner >= 0)
+    change = owner[seen[1:]] != owner[seen[:-1]]
+    return bool(np.any(np.diff(seen)[change] - 1 < few))
 
 
 def beside_artificial_ends(

@@ -21,6 +21,7 @@ from bimfit.estimation.ownership import (
     beside_artificial_ends,
     cover_cost,
     first_round,
+    meeting,
     second_round,
     split_side,
     through,
@@ -113,8 +114,10 @@ def estimate_station(
     turned = dataclasses.replace(slid, pose=slid.rival, rival=slid.pose)
     other = _components(context, slice_, turned, cost, (None, None), reason)
     odds = _evidence(other) - _evidence(best)
-    if odds > 0.0:
-        best, odds = other, -odds
+    if best.status.measured and not other.status.measured:
+        return best  # what explains more by being impossible is no rival
+    if odds > 0.0 or (other.status.measured and not best.status.measured):
+        best, odds = other, -abs(odds)
     return checks.with_rival(best, odds)
 
 
@@ -199,10 +202,16 @@ def _components(
     scene = _scene(context, poses)
     passed = _through(context, poses, scene)
     both = np.isfinite(scene.rho[0]) & np.isfinite(scene.rho[1])
-    if all(p is not None for p in first) and (bool(np.any(both & usable)) or passed < _FEW_THROUGH):
+    if all(p is not None for p in first) and (
+        bool(np.any(both & usable)) or passed < _FEW_THROUGH or meeting(scene, _FEW_THROUGH)
+    ):
         posteriors = list(first)
+        # near the mouth two bodies lie side by side; deep in a groove they meet, nobody knows just where
+        shallow = pose.inverse().apply(beams.points)[:, 1] > -3.0 * context.sensor.sigma
         for which in (0, 1):
-            use, spent = second_round(which, scene, side, beams, cost, context.model, territory=passed > 0)
+            use, spent = second_round(
+                which, scene, side, beams, cost, context.model, territory=shallow & (passed > 0)
+            )
             posteriors[which] = _one(context, which, pose, use & usable, spent, window, poses[which])
             poses[which] = posteriors[which].pose if posteriors[which] is not None else pose  # type: ignore[union-attr]
             scene = _scene(context, poses)
