@@ -30,7 +30,8 @@ def whole_file(path: str | Path) -> Iterator[Path]:
         handle, name = tempfile.mkstemp(prefix=f".{target.stem}-", suffix=target.suffix, dir=target.parent)
         os.close(handle)
     except OSError as error:
-        raise ExportError(f"cannot be written: {error.strerror}", file=target, remedy="choose another place") from error
+        reason = f"cannot be written: {error.strerror}"
+        raise ExportError(reason, file=target, remedy="choose another place") from error
     part = Path(name)
     try:
         yield part
@@ -65,7 +66,8 @@ def protect_inputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
     taken = {_identity(path) for path in inputs}
     for path in outputs:
         if _identity(path) in taken:
-            raise ExportError("is an input of this run and is never overwritten", file=path, remedy="choose another -o")
+            reason = "is an input of this run and is never overwritten"
+            raise ExportError(reason, file=path, remedy="choose another -o")
 
 
 def _identity(path: Path) -> object:

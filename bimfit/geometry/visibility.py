@@ -81,3 +81,27 @@ def _nearest_pieces(edges: Array) -> list[tuple[int, Array]]:
         scale = offset[i] / (rays @ normal[i])
         out.append((i, rays * scale[:, None]))
     return out
+
+
+def clip_edges(edges: ArrayLike, low: ArrayLike, high: ArrayLike) -> Array:
+    """The parts of directed edges (n, 2, 2) inside an upright box, shape (k, 2, 2), k <= n.
+
+    Parameters
+    ----------
+    edges : array_like, shape (n, 2, 2)
+    low, high : array_like, shape (2,)
+        Corners of the box.
+    """
+    e = np.asarray(edges, float).reshape(-1, 2, 2)
+    start, along = e[:, 0], e[:, 1] - e[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a = (np.asarray(low, float) - start) / along
+        b = (np.asarray(high, float) - start) / along
+    outside = (along == 0.0) & ((start < low) | (start > high))
+    flat = along == 0.0
+    enter = np.where(flat, 0.0, np.minimum(a, b)).max(axis=1).clip(0.0, None)
+    leave = np.where(flat, 1.0, np.maximum(a, b)).min(axis=1).clip(None, 1.0)
+    kept = (enter < leave) & ~outside.any(axis=1)
+    whole = kept & (enter == 0.0) & (leave == 1.0)
+    parts = np.stack([start + enter[:, None] * along, start + leave[:, None] * along], axis=1)
+    return np.asarray(np.where(whole[:, None, None], e, parts)[kept])

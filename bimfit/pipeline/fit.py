@@ -20,7 +20,16 @@ from bimfit.geometry.slice import Slice
 from bimfit.geometry.status import Status
 from bimfit.pipeline.records import ComponentResult, JointResult, StationResult
 from bimfit.pipeline.stitch import stitch
-from bimfit.pipeline.targets import TargetCache, Targets, distinct, prepare
+from bimfit.pipeline.targets import (
+    COMBINED_BREAK_EVEN,
+    COMPONENT_BREAK_EVEN,
+    TargetCache,
+    Targets,
+    distinct,
+    economic,
+    matched_slice,
+    prepare,
+)
 from bimfit.registration.matchers import MATCHERS
 from bimfit.registration.result import MatchResult
 
@@ -89,7 +98,7 @@ def fit_joint(
     else:
         motion = "independent"
     stations = tuple(_station_result(joint, fit) for fit in fits)
-    mesh, volumes = stitch(stations)
+    mesh, volumes = stitch(stations, joint.path.length if joint.path.closed else None)
     built = sum(table.seconds for target in distinct(targets) for table in target.kept.values())
     return JointResult(joint, method, stations, mesh, volumes, motion, time.perf_counter() - begin, built)
 
@@ -100,11 +109,13 @@ def fit_station(
     """One station: the combined model first, then each component in its own small window (paper, 4.4)."""
     begin = time.perf_counter()
     match = MATCHERS[_MATCHER_OF.get(method, method)]
-    combined = match(targets.combined, slice_, DESIGNED, config.search)
+    wide = economic(config.search, targets.stations, COMBINED_BREAK_EVEN)
+    near = matched_slice(slice_, config)
+    combined = match(targets.combined, near, DESIGNED, wide)
     components: tuple[MatchResult, MatchResult] | None = None
     if combined.found:
-        search = component_search(section, config)
-        a, b = (match(target, slice_, combined.pose, search) for target in targets.components)
+        search = economic(component_search(section, config), targets.stations, COMPONENT_BREAK_EVEN)
+        a, b = (match(target, near, combined.pose, search) for target in targets.components)
         components = (a, b)
     estimate = None
     if method == "grcsm":
@@ -163,7 +174,8 @@ def _along_the_joint(fits: list[StationFit], config: Config, motion: str) -> tup
         return fits, motion
     from bimfit.estimation.motion import estimate_joint
 
-    whole = estimate_joint([fit.estimate for fit in fits], [fit.section for fit in fits], motion)
+    estimates = [fit.estimate for fit in fits if fit.estimate is not None]
+    whole = estimate_joint(estimates, [fit.section for fit in fits], motion)
     return [
         dataclasses.replace(f, estimate=e) for f, e in zip(fits, whole.stations, strict=True)
     ], whole.model

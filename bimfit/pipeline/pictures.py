@@ -17,7 +17,7 @@ from bimfit.geometry.pose import Array
 from bimfit.pipeline.fit import DESIGNED
 from bimfit.pipeline.output import safe_name
 from bimfit.pipeline.records import JointResult, StationResult, SurveyResult
-from bimfit.pipeline.targets import expected_viewpoint, make_targets
+from bimfit.pipeline.targets import expected_viewpoint, make_targets, matched_edges, matched_slice
 from bimfit.registration.lattice import Lattice
 from bimfit.registration.matchers import match
 from bimfit.report.plots import GapSeries, plot_gap_poses, plot_slice
@@ -110,15 +110,17 @@ def gap_series(joint: JointResult) -> GapSeries:
             columns[key].append(np.nan if sigma is None else float(getattr(sigma, name)))
     s = np.array([station.section.s for station in joint.stations])
     c = {name: np.array(values) for name, values in columns.items()}
-    share = _half_distances(s)
+    volumes = joint.volumes
+    volume = np.full(len(s), np.nan) if volumes is None else volumes.increments
     area = np.array([np.nan if t.gap is None else t.gap.area for t in joint.stations])
+    share = volume / np.where(area > 0.0, area, np.nan)
     known = bool(np.isfinite(c["sx"]).any())
     return GapSeries(
         s,
         c["x"],
         c["z"],
         c["angle"],
-        area * share,
+        volume,
         *((c["sx"], c["sz"], c["sa"], c["sarea"] * share) if known else (None,) * 4),
     )
 
@@ -160,8 +162,10 @@ def draw_slice(path: Path, station: StationResult) -> Path:
 
 def draw_tables(path: Path, station: StationResult, config: Config) -> Path:
     """Look-up tables from coarse to fine, with the scan at the best pose of each level (figures 2 to 4)."""
-    target = make_targets(station.section, expected_viewpoint(station.slice), config).combined
-    start = station.slice.points
+    edges = matched_edges(station.section, expected_viewpoint(station.slice), config)
+    target = make_targets(edges, config).combined
+    near = matched_slice(station.slice, config)
+    start = near.points
     finest = Lattice.of(config.search)
     table = target.tables(finest, "overlap", float(np.hypot(*(start - start.mean(axis=0)).T).max()))
     levels = []
@@ -171,7 +175,7 @@ def draw_tables(path: Path, station: StationResult, config: Config) -> Path:
             q * s ** min(level - 1, count - 1)
             for q, s, count in zip(finest.step, finest.tests, finest.levels, strict=True)
         )
-        found = match(target, station.slice, DESIGNED, dataclasses.replace(config.search, tolerance=coarse))
+        found = match(target, near, DESIGNED, dataclasses.replace(config.search, tolerance=coarse))
         values, extent = _blocks(table.leaf, table.origin, finest.step, factor)
         label = f"level {level}: {finest.step[0] * factor * 1e3:.3g} mm"
         moved = found.pose.inverse().apply(start) if found.found else None
@@ -234,7 +238,10 @@ def folder_scene(folder: Path) -> JointScene:
         np.concatenate([mesh.vertices for mesh in meshes]),
         np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]),
     )
-    return JointScene(elements=_model_elements(results), gap=gap, title=str(folder))
+    widths = [mesh.metadata["_ply_raw"]["vertex"]["data"]["width"].ravel() for mesh in meshes]
+    return JointScene(
+        elements=_model_elements(results), gap=gap, gap_width=np.concatenate(widths), title=str(folder)
+    )
 
 
 def _model_elements(results: dict[str, Any]) -> list[TriangleMesh]:

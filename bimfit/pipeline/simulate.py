@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from bimfit.bim.stations import design_sections
 from bimfit.config import Config, FitConfig
@@ -13,7 +16,7 @@ from bimfit.errors import JointError
 from bimfit.geometry.line_scan import LineScan, joined
 from bimfit.pipeline.survey import model_joints
 from bimfit.simulation.motion import random_truth
-from bimfit.simulation.rangefinder import simulate_scan
+from bimfit.simulation.rangefinder import aim, simulate_scan
 from bimfit.simulation.scenario import Scenario
 from bimfit.simulation.truth import JointTruth
 
@@ -62,24 +65,36 @@ def simulate(
 
 
 def designed(model: Model, joint: Joint, scenario: Scenario) -> tuple[JointSection, ...]:
-    """The joint's design where the scenario's sweeps cross it.
+    """The joint's design where the scenario's sweeps cross it, from the side that is easier to look into.
 
     Raises
     ------
     JointError
         When no cross-section shows both components.
     """
-    sections = design_sections(model, joint, scenario.stations(joint.length), sensor_reach(scenario))
+    reach = sensor_reach(scenario)
+    middle = np.array([0.5 * joint.length])
+    sides = [joint]
+    if joint.two_sided:
+        sides.append(dataclasses.replace(joint, path=joint.path.flipped()))
+    seen = [(side, design_sections(model, side, middle, reach)) for side in sides]
+    slants = [(_slant(cut[0], scenario), k) for k, (_, cut) in enumerate(seen) if cut]
+    best = sides[min(slants)[1]] if slants else joint
+    sections = design_sections(model, best, scenario.stations(joint.length), reach)
     if not sections:
         raise JointError("no cross-section shows a gap between both elements", place=f"joint {joint.id}")
     return sections
 
 
+def _slant(section: JointSection, scenario: Scenario) -> float:
+    """How far from straight out of the mouth the sensor has to be held, rad, to the degree."""
+    out = aim(section, scenario.sensor_height)
+    return round(math.degrees(math.atan2(abs(out[0]), out[1])))
+
+
 def sensor_reach(scenario: Scenario) -> float:
-    """How far from the joint the virtual sensor can meet a component, m, with room for its motion."""
-    opening = min(scenario.bearing_limit + scenario.common_angle, 1.5)
-    wide = scenario.sensor_height * math.tan(opening) + max(scenario.common_shift)
-    return max(FitConfig.reach, min(1.2 * wide, scenario.max_range))
+    """How far from the joint the components are kept, m: a slanting view meets them far out."""
+    return max(FitConfig.reach, min(4.0 * scenario.sensor_height, scenario.max_range))
 
 
 def longest_open(joints: Sequence[Joint]) -> Joint:

@@ -9,10 +9,19 @@ from bimfit.gap.volume import Volumes, gap_volumes
 from bimfit.pipeline.records import StationResult
 
 
-def stitch(stations: Sequence[StationResult]) -> tuple[GapMesh | None, Volumes | None]:
-    """Loft the measured stations and take the paper's volume beside the mesh's."""
+def stitch(
+    stations: Sequence[StationResult], ring: float | None = None
+) -> tuple[GapMesh | None, Volumes | None]:
+    """Loft the measured stations and take the paper's volume beside the mesh's.
+
+    Parameters
+    ----------
+    stations : sequence of StationResult
+    ring : float, optional
+        Length of a path that closes on itself, m.
+    """
     gaps = [station.gap for station in stations]
     if not any(gap is not None for gap in gaps):
         return None, None
-    mesh = loft(gaps)
-    return (None if mesh.empty else mesh), gap_volumes(gaps, mesh)
+    mesh = loft(gaps, ring=ring)
+    return (None if mesh.empty else mesh), gap_volumes(gaps, mesh, ring=ring)

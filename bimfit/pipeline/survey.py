@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -14,10 +15,12 @@ from bimfit.config import Config, JointConfig
 from bimfit.errors import JointError, ScanError
 from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.line_scan import LineScan
+from bimfit.geometry.path import JointPath
 from bimfit.geometry.pose import Array
 from bimfit.geometry.slice import Slice
 from bimfit.pipeline.fit import fit_joint
 from bimfit.pipeline.records import JointResult, SurveyResult
+from bimfit.pipeline.targets import match_reach
 from bimfit.scan.cloud import PointCloud
 from bimfit.scan.coverage import covers, scan_stations
 from bimfit.scan.slicing import cut_slices
@@ -30,8 +33,6 @@ Scan = LineScan | PointCloud
 LEAST_COVER = 0.3
 """A joint that was not asked for by name is fitted where the scan shows at least this share of it."""
 NEAR = 0.3
-SCAN_MARGIN = 0.1
-"""How much farther than the components' profiles the scan is kept, since they may have moved, m."""
 Progress = Callable[[str, float], None]
 
 
@@ -51,15 +52,14 @@ def model_joints(
     JointError
         When a joint that is asked for does not exist.
     """
-    from bimfit.bim.joints import find_joints, select_joints
+    from bimfit.bim.joints import find_joints, no_joint_reason, select_joints
     from bimfit.bim.model import load_model
 
     model = load_model(path)
     joints = select_joints(model, wanted, config) if wanted else find_joints(model, config)
     if not joints:
         raise JointError(
-            f"no joint found: no two of its {len(model.elements)} elements face each other across "
-            f"0 to {config.max_gap * 1e3:.0f} mm over {config.min_length * 1e3:.0f} mm",
+            f"no joint found: {no_joint_reason(model, config)}",
             file=path,
             remedy="name the pair with --joint GUID,GUID or widen --max-gap",
         )
@@ -146,7 +146,23 @@ def load_scan(path: Path, pose: Array | None = None) -> Scan:
 def covered_joints(joints: Sequence[Joint], scan: Scan, *, asked: bool) -> list[Joint]:
     """Joints that the scan shows: any of their length where they were asked for, else a good part of it."""
     least = 0.0 if asked else LEAST_COVER
-    return [joint for joint in joints if covers(scan, joint.path) > least]
+    return [joint for joint in joints if max(covers(scan, path, NEAR) for path in mouth_paths(joint)) > least]
+
+
+def mouth_paths(joint: Joint) -> tuple[JointPath, JointPath]:
+    """The joint's path shifted from mid-gap to its mouth, and to its root, in case that is the side seen."""
+    return _shifted(joint.path, 0.5 * joint.depth), _shifted(joint.path, -0.5 * joint.depth)
+
+
+def _shifted(path: JointPath, distance: float) -> JointPath:
+    """A path shifted along v, its stations where they were; curved paths keep each leg's own v."""
+    v = np.concatenate([path.v[:1], 0.5 * (path.v[1:] + path.v[:-1]), path.v[-1:]])
+    if path.closed:
+        v[0] = v[-1] = 0.5 * (path.v[0] + path.v[-1])
+    try:
+        return dataclasses.replace(path, points=path.points + distance * v)
+    except ValueError:  # an arc tighter than the joint is deep
+        return path
 
 
 def cut_joint(
@@ -162,7 +178,9 @@ def cut_joint(
     eye = viewpoint_of(scan, joint)
     if eye is not None:
         joint = joint.facing(eye)
-    stations = scan_stations(scan, joint.path, config.slices.spacing)
+    mouth = mouth_paths(joint)[0]
+    along = scan_stations(scan, mouth, config.slices.spacing)
+    stations = np.interp(along, mouth.stops, joint.path.stops)
     sections = design_sections(elements, joint, stations) if len(stations) else ()
     if not sections:
         return joint, (), ()
@@ -171,7 +189,7 @@ def cut_joint(
         [section.frame for section in sections],
         [section.s for section in sections],
         thickness=config.slices.thickness,
-        reach=config.fit.reach + SCAN_MARGIN,
+        reach=match_reach(config),
     )
     return joint, tuple(sections), slices
 
@@ -180,10 +198,13 @@ def viewpoint_of(scan: Scan, joint: Joint) -> Array | None:
     """Where the sensor was while it saw the joint, in world coordinates; None when the scan does not say."""
     if isinstance(scan, PointCloud):
         return scan.viewpoint
-    low, high = joint.path.points.min(axis=0) - NEAR, joint.path.points.max(axis=0) + NEAR
     ends = scan.origins + scan.directions * scan.ranges[:, None]
-    near = ((ends >= low) & (ends <= high)).all(axis=1)
-    return scan.origins[near].mean(axis=0) if near.any() else None
+    for path in sorted(mouth_paths(joint), key=lambda path: -covers(scan, path, NEAR)):
+        low, high = path.points.min(axis=0) - NEAR, path.points.max(axis=0) + NEAR
+        near = ((ends >= low) & (ends <= high)).all(axis=1)
+        if near.any():
+            return np.asarray(scan.origins[near].mean(axis=0))
+    return None
 
 
 def _far_message(model: Model, scan: Scan, asked: bool) -> str:

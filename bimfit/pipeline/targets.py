@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from bimfit.config import Config
+from bimfit.config import Config, SearchConfig
 from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.pose import Array
 from bimfit.geometry.slice import Slice
-from bimfit.geometry.visibility import visible_edges
+from bimfit.geometry.visibility import clip_edges, visible_edges
 from bimfit.registration.table import Target
 
+COMBINED_BREAK_EVEN, COMPONENT_BREAK_EVEN = 80, 800
+"""Slices from which on majorant tables pay for themselves, in the wide and in a component's small window."""
+_MARGIN = 0.1
+"""How much farther than the components' profiles a scan is used, since they may have moved, m."""
 _FAR_VIEW = 1.0
 _VIEW_ANGLE = math.radians(2.0)
 _VIEW_RATIO = 1.05
@@ -22,10 +28,19 @@ _VIEW_RATIO = 1.05
 
 @dataclass(frozen=True)
 class Targets:
-    """The combined model and each component by itself, at one station."""
+    """The combined model and each component by itself, at one station.
+
+    Attributes
+    ----------
+    combined : Target
+    components : tuple of two Target
+    stations : int
+        How many stations share them.
+    """
 
     combined: Target
     components: tuple[Target, Target]
+    stations: int = 1
 
     @property
     def all(self) -> tuple[Target, Target, Target]:
@@ -33,9 +48,16 @@ class Targets:
         return (self.combined, *self.components)
 
 
+Edges = tuple[Array, ...]
+
+
 @dataclass
 class TargetCache:
-    """Targets shared by all stations that have the same profiles and see them from about the same place.
+    """Targets shared by all stations that show the sensor the same surface.
+
+    Tables are the expensive part of a joint. Stations share them where their visible surfaces differ by
+    less than a quarter of the search's tolerance, as along a joint that tapers or follows an arc; the
+    search's answer is refined against each station's own profile anyway.
 
     Parameters
     ----------
@@ -46,32 +68,68 @@ class TargetCache:
 
     config: Config
     outlines: bool = False
-    _made: dict[tuple[object, ...], Targets] = field(default_factory=dict)
+    _known: dict[tuple[object, ...], tuple[JointSection, Targets]] = field(default_factory=dict)
+    _made: list[tuple[Edges, Targets]] = field(default_factory=list)
 
     def get(self, section: JointSection, slice_: Slice) -> Targets:
         """The targets for a station, made when there are none yet."""
         viewpoint = expected_viewpoint(slice_)
         key = (*(id(profile) for profile in section.components), *_view_cell(viewpoint))
-        if key not in self._made:
-            self._made[key] = make_targets(section, viewpoint, self.config, outlines=self.outlines)
-        return self._made[key]
+        if key not in self._known:
+            edges = matched_edges(section, viewpoint, self.config, outlines=self.outlines)
+            self._known[key] = (section, self._shared(edges))
+        return self._known[key][1]
+
+    def _shared(self, edges: Edges) -> Targets:
+        slack = 0.25 * min(self.config.search.tolerance[:2])
+        for other, targets in self._made:
+            if all(
+                p.shape == q.shape and np.allclose(p, q, rtol=0.0, atol=slack)
+                for p, q in zip(edges, other, strict=True)
+            ):
+                return targets
+        made = make_targets(edges, self.config, outlines=self.outlines)
+        self._made.append((edges, made))
+        return made
 
 
-def make_targets(
+def matched_edges(
     section: JointSection, viewpoint: Array, config: Config, *, outlines: bool = False
-) -> Targets:
-    """Build a station's targets.
+) -> Edges:
+    """What of each component is matched: its visible surface, or its whole outline as in the paper.
 
-    The combined model is not the joint, since each component has moved by itself: its table is blurred by
-    sqrt(sensor sigma^2 + placement sigma^2) (METHOD, section 2c); a component's by the sensor's sigma.
+    Only what lies within reach of the mouth: tables grow with the surface, and the sides of a deep gap say
+    nothing more.
     """
     if outlines:
-        edges = tuple(profile.edges[profile.surface] for profile in section.components)
-        blur = config.sensor.sigma
+        edges: Edges = tuple(profile.edges[profile.surface] for profile in section.components)
     else:
         edges = visible_edges(section.components, viewpoint)
-        blur = math.hypot(config.sensor.sigma, config.fit.placement_sigma)
-    a, b = (Target.of(part, config.sensor.sigma) for part in edges)
+    box = np.full(2, match_reach(config))
+    return tuple(clip_edges(part, -box, box) for part in edges)
+
+
+def matched_slice(slice_: Slice, config: Config) -> Slice:
+    """The returns that are matched: those within reach of the mouth, without what shone through the gap."""
+    near = (np.abs(slice_.points) <= match_reach(config)).all(axis=1)
+    return slice_ if near.all() else dataclasses.replace(slice_, points=slice_.points[near], beams=None)
+
+
+def match_reach(config: Config) -> float:
+    """How far from the mouth surface and returns are matched, m."""
+    return config.fit.reach + _MARGIN
+
+
+def make_targets(edges: Edges, config: Config, *, outlines: bool = False) -> Targets:
+    """Build a station's targets from each component's edges.
+
+    The combined model is not the joint, since each component has moved by itself: its table is blurred by
+    sqrt(sensor sigma^2 + placement sigma^2) (METHOD, section 2c); a component's, and the paper's, by the
+    sensor's sigma.
+    """
+    sigma = config.sensor.sigma
+    blur = sigma if outlines else math.hypot(sigma, config.fit.placement_sigma)
+    a, b = (Target.of(part, sigma) for part in edges)
     return Targets(Target.of(np.concatenate(edges), blur), (a, b))
 
 
@@ -89,7 +147,21 @@ def _view_cell(viewpoint: Array) -> tuple[int, int]:
 
 def prepare(sections: Sequence[JointSection], slices: Sequence[Slice], cache: TargetCache) -> list[Targets]:
     """Targets for every station, in order."""
-    return [cache.get(section, slice_) for section, slice_ in zip(sections, slices, strict=True)]
+    found = [cache.get(section, slice_) for section, slice_ in zip(sections, slices, strict=True)]
+    count = Counter(id(targets) for targets in found)
+    counted = {id(t): dataclasses.replace(t, stations=count[id(t)]) for t in found}
+    return [counted[id(targets)] for targets in found]
+
+
+def economic(search: SearchConfig, stations: int, break_even: int) -> SearchConfig:
+    """The same search by the bound that is cheaper in all, tables included.
+
+    Affine majorants search several times faster than overlapped block maxima but take far longer to build.
+    Both are proven and find the same pose.
+    """
+    if search.bound == "majorant" and stations < break_even:
+        return dataclasses.replace(search, bound="overlap")
+    return search
 
 
 def distinct(targets: Sequence[Targets]) -> list[Target]:

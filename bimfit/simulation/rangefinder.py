@@ -14,6 +14,7 @@ from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.line_scan import LineScan
 from bimfit.geometry.pose import Array
 from bimfit.geometry.profile import Profile
+from bimfit.simulation.aim import open_direction
 from bimfit.simulation.scenario import Scenario
 from bimfit.simulation.truth import JointTruth
 
@@ -76,8 +77,9 @@ def simulate_scan(
 ) -> LineScan:
     """Scan a joint as built, one sweep a section.
 
-    The sensor is where the plan has it: ``sensor_height`` over the designed joint along v, looking
-    along -v, wherever the components have really gone. Ranges get noise N(0, sigma), correlated from beam to
+    The sensor is where the plan has it: ``sensor_height`` from the designed mouth, looking at it; straight
+    over a butt joint, half way between the faces of a corner (:func:`aim`), wherever
+    the components have really gone. Ranges get noise N(0, sigma), correlated from beam to
     beam if asked; then returns get lost, and beams return from anywhere in range instead.
 
     Parameters
@@ -102,8 +104,8 @@ def simulate_scan(
     """
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_NOISE_STREAM,)))
     bearings = scenario.bearings
-    eye = np.array([0.0, scenario.sensor_height])
-    directions = np.stack([np.sin(bearings), -np.cos(bearings)], axis=1)
+    out = aim(sections[len(sections) // 2], scenario.sensor_height) if sections else None
+    eye, directions = _view(out, scenario, bearings)
     starts = np.broadcast_to(eye, directions.shape)
     origins, rays, ranges = [], [], []
     for section, station in zip(sections, truth.stations, strict=True):
@@ -125,6 +127,23 @@ def simulate_scan(
         np.concatenate(ranges) if count else [],
         source=f"simulated, seed {seed}",
     )
+
+
+def aim(section: JointSection, reach: float) -> Array:
+    """Unit direction (2,) from a joint's mouth to where the sensor is best held: it halves the open angle."""
+
+    def ranges(origins: Array, directions: Array) -> Array:
+        return cast(section.components, origins, directions).ranges
+
+    return open_direction(section, ranges, reach)
+
+
+def _view(out: Array | None, scenario: Scenario, bearings: Array) -> tuple[Array, Array]:
+    """Sensor position (2,) and beam directions (n, 2) in the section, ascending in bearing."""
+    outward = np.array([0.0, 1.0]) if out is None else out
+    across = np.array([outward[1], -outward[0]])
+    directions = np.sin(bearings)[:, None] * across - np.cos(bearings)[:, None] * outward
+    return scenario.sensor_height * outward, directions
 
 
 def measured(true_ranges: Array, scenario: Scenario, rng: np.random.Generator) -> Array:

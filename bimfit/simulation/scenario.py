@@ -44,7 +44,7 @@ class Scenario:
     spacing : float
         Distance between sweeps along the joint, m.
     sensor_height : float
-        Height of the sensor over the designed joint along v, m; it looks along -v.
+        Distance of the sensor from the designed mouth, m, half way between the faces beside it.
     bearing_step, bearing_limit : float
         Between beams, and the half opening, rad.
     sigma : float
