@@ -49,6 +49,9 @@ class SensorConfig:
         Farthest range the sensor reports, m.
     missing_means_gap : bool
         Whether a beam that returned nothing is evidence that nothing is there.
+    adapt : bool
+        Whether sigma, the shares and the correlation of neighbouring beams are estimated anew from each
+        joint's residuals.
     """
 
     sigma: float = 0.003
@@ -56,6 +59,7 @@ class SensorConfig:
     miss_share: float = 0.01
     max_range: float = 5.6
     missing_means_gap: bool = True
+    adapt: bool = True
 
     def __post_init__(self) -> None:
         _positive(self, "sigma", "max_range")

@@ -87,7 +87,7 @@ def build_config(
     if thickness:
         slices = dataclasses.replace(slices, thickness=length(thickness, "--thickness"))
     if sigma:
-        sensor = dataclasses.replace(sensor, sigma=length(sigma, "--sigma"))
+        sensor = dataclasses.replace(sensor, sigma=length(sigma, "--sigma"), adapt=False)
     return dataclasses.replace(config, search=search, slices=slices, sensor=sensor)
 
 

@@ -18,7 +18,7 @@ from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.pose import Array
 from bimfit.geometry.slice import Slice
 from bimfit.pipeline.accuracy import joint_errors
-from bimfit.pipeline.fit import METHODS, fit_joint
+from bimfit.pipeline.fit import METHODS, check_choice, fit_joint
 from bimfit.pipeline.records import JointResult
 from bimfit.pipeline.results import to_json
 from bimfit.report.tables import MethodOutcome, plot_comparison
@@ -192,12 +192,12 @@ def check_methods(methods: Sequence[str]) -> None:
     Raises
     ------
     ConfigError
-        Naming them and those that do.
+        Naming those that do.
     """
-    unknown = [name for name in methods if name not in METHODS]
-    if unknown or not methods:
-        what = f"unknown method {', '.join(unknown)}" if unknown else "no method named"
-        raise ConfigError(what, remedy=f"choose from {', '.join(METHODS)}")
+    if not methods:
+        raise ConfigError("no method named", remedy=f"choose from {', '.join(METHODS)}")
+    for method in methods:
+        check_choice(method)
 
 
 def comparison_table(comparison: Comparison) -> str:

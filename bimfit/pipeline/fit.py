@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -10,7 +11,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from bimfit.config import Config, SearchConfig
+from bimfit.config import Config, SearchConfig, SensorConfig
+from bimfit.errors import ConfigError
+from bimfit.estimation.motion import estimate_joint
+from bimfit.estimation.noise import Noise, estimate_noise
 from bimfit.estimation.result import StationEstimate
 from bimfit.estimation.station import estimate_station
 from bimfit.gap.section import gap_section
@@ -40,6 +44,9 @@ DESIGNED = Pose2D()
 _MATCHER_OF = {"paper": "block", "search": "grcsm"}
 METHODS = ("grcsm", "search", "paper", *(name for name in MATCHERS if name != "grcsm"))
 """What :func:`fit_joint` can be asked for."""
+MOTIONS = ("auto", "independent", "const", "rigid", "linear", "smooth", "kinked")
+"""Motion models along the joint."""
+_OTHER_SIGMA, _OTHER_SHARE = 0.1, 0.015
 
 
 @dataclass(frozen=True)
@@ -89,18 +96,42 @@ def fit_joint(
     -------
     JointResult
         With a status and a reason at each station; a fit that failed is never an exception.
+
+    Raises
+    ------
+    ConfigError
+        For a method or a motion model that does not exist.
     """
+    check_choice(method, motion)
     begin = time.perf_counter()
     targets = prepare(sections, slices, TargetCache(config, outlines=method == "paper"))
     fits = _fit_stations(sections, slices, targets, config, method, threads, progress)
+    noise = None
     if method == "grcsm":
-        fits, motion = _along_the_joint(fits, config, motion)
+        noise = estimate_noise([fit.estimate for fit in fits if fit.estimate is not None], config.sensor)
+        fits = _with_noise(fits, noise, config)
+        fits, motion = _along_the_joint(fits, motion)
     else:
         motion = "independent"
     stations = tuple(_station_result(joint, fit) for fit in fits)
     mesh, volumes = stitch(stations, joint.path.length if joint.path.closed else None)
     built = sum(table.seconds for target in distinct(targets) for table in target.kept.values())
-    return JointResult(joint, method, stations, mesh, volumes, motion, time.perf_counter() - begin, built)
+    return JointResult(
+        joint, method, stations, mesh, volumes, motion, noise, time.perf_counter() - begin, built
+    )
+
+
+def check_choice(method: str, motion: str = "auto") -> None:
+    """Refuse a method or a motion model that does not exist.
+
+    Raises
+    ------
+    ConfigError
+        Naming those that do.
+    """
+    for kind, name, known in (("method", method, METHODS), ("motion", motion, MOTIONS)):
+        if name not in known:
+            raise ConfigError(f"unknown {kind} {name}", remedy=f"choose from {', '.join(known)}")
 
 
 def fit_station(
@@ -117,18 +148,22 @@ def fit_station(
         search = economic(component_search(section, config), targets.stations, COMPONENT_BREAK_EVEN)
         a, b = (match(target, near, combined.pose, search) for target in targets.components)
         components = (a, b)
-    estimate = None
+    fit = StationFit(section, slice_, combined, components, None, 0.0)
     if method == "grcsm":
-        estimate = estimate_station(
-            section,
-            slice_,
-            combined.pose if combined.found else None,
-            config.sensor,
-            config.fit,
-            component_matches=_poses(components),
-            rivals=[mode.pose for mode in combined.modes],
-        )
-    return StationFit(section, slice_, combined, components, estimate, time.perf_counter() - begin)
+        fit = dataclasses.replace(fit, estimate=_estimate(fit, config.sensor, config))
+    return dataclasses.replace(fit, seconds=time.perf_counter() - begin)
+
+
+def _estimate(fit: StationFit, sensor: SensorConfig, config: Config) -> StationEstimate:
+    return estimate_station(
+        fit.section,
+        fit.slice,
+        fit.combined.pose if fit.combined.found else None,
+        sensor,
+        config.fit,
+        component_matches=_poses(fit.components),
+        rivals=[mode.pose for mode in fit.combined.modes],
+    )
 
 
 def _poses(matches: tuple[MatchResult, MatchResult] | None) -> tuple[Pose2D | None, Pose2D | None]:
@@ -168,12 +203,32 @@ def _fit_stations(
     return fits
 
 
-def _along_the_joint(fits: list[StationFit], config: Config, motion: str) -> tuple[list[StationFit], str]:
-    """Replace the stations' estimates by those of the joint as a whole (METHOD, section 5)."""
-    if motion == "independent":
-        return fits, motion
-    from bimfit.estimation.motion import estimate_joint
+def _with_noise(fits: list[StationFit], noise: Noise, config: Config) -> list[StationFit]:
+    """Estimate again where the joint's own residuals say that the sensor is not as it was assumed to be."""
+    if not config.sensor.adapt or not _differs(noise.sensor, config.sensor):
+        return fits
+    again = []
+    for fit in fits:
+        begin = time.perf_counter()
+        estimate = _estimate(fit, noise.sensor, config)
+        again.append(
+            dataclasses.replace(fit, estimate=estimate, seconds=fit.seconds + time.perf_counter() - begin)
+        )
+    return again
 
+
+def _differs(found: SensorConfig, assumed: SensorConfig) -> bool:
+    return (
+        abs(math.log(found.sigma / assumed.sigma)) > _OTHER_SIGMA
+        or abs(found.outlier_share - assumed.outlier_share) > _OTHER_SHARE
+        or abs(found.miss_share - assumed.miss_share) > _OTHER_SHARE
+    )
+
+
+def _along_the_joint(fits: list[StationFit], motion: str) -> tuple[list[StationFit], str]:
+    """Replace the stations' estimates by those of the joint as a whole (METHOD, section 5)."""
+    if motion == "independent" or not fits:
+        return fits, "independent"
     estimates = [fit.estimate for fit in fits if fit.estimate is not None]
     whole = estimate_joint(estimates, [fit.section for fit in fits], motion)
     return [

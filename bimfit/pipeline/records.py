@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from bimfit.bim.joint import Joint
     from bimfit.bim.model import Model
     from bimfit.config import Config
+    from bimfit.estimation.noise import Noise
     from bimfit.gap.mesh import GapMesh
     from bimfit.gap.section import GapSection
     from bimfit.gap.volume import Volumes
@@ -78,6 +79,8 @@ class JointResult:
     volumes : Volumes or None
     motion : str
         The motion model along the joint that was chosen.
+    noise : Noise or None
+        What the residuals say of the sensor; None where no estimate was made.
     seconds : float
         Wall time for the joint, without reading files.
     table_seconds : float
@@ -90,6 +93,7 @@ class JointResult:
     mesh: GapMesh | None
     volumes: Volumes | None
     motion: str = "independent"
+    noise: Noise | None = None
     seconds: float = 0.0
     table_seconds: float = 0.0
 

@@ -48,6 +48,14 @@ def _joint(result: JointResult, files: Mapping[str, Any]) -> dict[str, Any]:
         **result.joint.to_dict(),
         "method": result.method,
         "motion": result.motion,
+        "noise": None
+        if result.noise is None
+        else {
+            "sigma": result.noise.sigma,
+            "correlation": result.noise.correlation,
+            "outlier_share": result.noise.outlier_share,
+            "miss_share": result.noise.miss_share,
+        },
         "status": "ok" if result.measured else "not estimated",
         "reason": result.reason,
         "stations": [_station(station) for station in result.stations],

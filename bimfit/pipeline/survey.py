@@ -18,7 +18,7 @@ from bimfit.geometry.line_scan import LineScan
 from bimfit.geometry.path import JointPath
 from bimfit.geometry.pose import Array
 from bimfit.geometry.slice import Slice
-from bimfit.pipeline.fit import fit_joint
+from bimfit.pipeline.fit import check_choice, fit_joint
 from bimfit.pipeline.records import JointResult, SurveyResult
 from bimfit.pipeline.targets import match_reach
 from bimfit.scan.cloud import PointCloud
@@ -99,6 +99,7 @@ def survey(
     BimfitError
         For a model, scan or joint that cannot be used.
     """
+    check_choice(method, motion)
     progress("reading the model", 0.0)
     model, found = model_joints(model_path, config.joints, joints)
     progress("reading the scan", 0.0)
