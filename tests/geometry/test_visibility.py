@@ -4,11 +4,12 @@ import math
 
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bimfit.geometry.profile import Profile
-from bimfit.geometry.visibility import visible_edges
+from bimfit.geometry.visibility import clip_edges, visible_edges
 
 
 def box(u0, v0, u1, v1):
@@ -37,7 +38,8 @@ def random_scene(rng):
     for k in range(rng.integers(1, 4)):
         count = rng.integers(3, 7)
         bearing = np.sort(rng.uniform(0, 2 * math.pi, count))
-        if np.min(np.diff(bearing, append=bearing[0] + 2 * math.pi)) < 0.2:
+        steps = np.diff(bearing, append=bearing[0] + 2 * math.pi)
+        if steps.min() < 0.2 or steps.max() > 3.0:  # beyond half a turn the loop may cross itself
             continue
         loop = 0.3 * np.column_stack([np.cos(bearing), np.sin(bearing)]) * rng.uniform(0.4, 1, (count, 1))
         profiles.append(Profile.polygon(loop + np.array([0.7 * k, rng.uniform(-0.3, 0.3)])))
@@ -80,6 +82,24 @@ def test_reference_scene_shows_top_and_inner_faces():
     right_wall = seen[1][np.isclose(seen[1][:, :, 0], 0.0125).all(axis=1)]
     # sight line over A's corner: it meets u = 0.0125 at v = -0.025 * 0.25 / 0.0875, below the root
     assert np.linalg.norm(right_wall[:, 1] - right_wall[:, 0], axis=1).sum() == pytest.approx(0.025, abs=1e-9)
+
+
+def test_clipped_edges_are_what_shapely_clips():
+    rng = np.random.default_rng(4)
+    edges = rng.uniform(-1, 1, (300, 2, 2))
+    edges[:40, 1, 0] = edges[:40, 0, 0]  # upright, level and inside ones too
+    edges[40:80, 1, 1] = edges[40:80, 0, 1]
+    edges[80:120] *= 0.2
+    low, high = np.array([-0.4, -0.3]), np.array([0.5, 0.35])
+    window = shapely.box(*low, *high)
+    expected = [shapely.intersection(shapely.LineString(e), window) for e in edges]
+    expected = [np.array(piece.coords) for piece in expected if piece.length > 0]
+    found = clip_edges(edges, low, high)
+    assert len(found) == len(expected)
+    for ours, theirs in zip(found, expected, strict=True):
+        assert np.allclose(ours, theirs) or np.allclose(ours, theirs[::-1])
+    inside = edges[80:120]
+    assert np.array_equal(clip_edges(inside, -np.ones(2), np.ones(2)), inside)
 
 
 def test_what_is_no_surface_hides_and_is_not_seen():
