@@ -65,7 +65,7 @@ def estimate_joint(
     -------
     JointEstimate
         Stations without an estimate stay without one. A station that disagrees with its neighbours counts
-        less, and is flagged.
+        less and is flagged; where its own returns are good in themselves, their estimate is what it keeps.
 
     Raises
     ------
@@ -298,10 +298,12 @@ def _apply(
                 outliers.append((i, "AB"[which]))
                 off = float(np.hypot(*(parts[which].value[i] - t.value[i])[:2])) * 1e3
                 reason = f"its own returns put it {off:.1f} mm away from what its neighbours say"
-                if c.status.name == "ok":
-                    c = replace(c, status=Status("ambiguous", reason))
                 if status.name == "ok":
                     status = Status("ambiguous", f"component {'AB'[which]}: {reason}")
+                if c.status.name == "ok":
+                    # A spike: a jump that no model of the motion has. What was measured well, stands.
+                    components.append(replace(c, status=Status("ambiguous", reason)))
+                    continue
             components.append(replace(c, pose=pose, covariance=J @ t.covariance[i] @ J.T))
         out.append(replace(station, components=(components[0], components[1]), status=status))
     return tuple(out), tuple(outliers)

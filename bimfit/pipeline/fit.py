@@ -29,6 +29,7 @@ from bimfit.pipeline.targets import (
     COMPONENT_BREAK_EVEN,
     TargetCache,
     Targets,
+    build_seconds,
     distinct,
     economic,
     matched_slice,
@@ -115,7 +116,7 @@ def fit_joint(
         motion = "independent"
     stations = tuple(_station_result(joint, fit) for fit in fits)
     mesh, volumes = stitch(stations, joint.path.length if joint.path.closed else None)
-    built = sum(table.seconds for target in distinct(targets) for table in target.kept.values())
+    built = sum(build_seconds(target) for target in distinct(targets))
     return JointResult(
         joint, method, stations, mesh, volumes, motion, noise, time.perf_counter() - begin, built
     )

@@ -15,7 +15,7 @@ from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.pose import Array
 from bimfit.geometry.slice import Slice
 from bimfit.geometry.visibility import clip_edges, visible_edges
-from bimfit.registration.table import Target
+from bimfit.registration.table import Tables, Target
 
 COMBINED_BREAK_EVEN, COMPONENT_BREAK_EVEN = 80, 800
 """Slices from which on majorant tables pay for themselves, in the wide and in a component's small window."""
@@ -167,3 +167,8 @@ def economic(search: SearchConfig, stations: int, break_even: int) -> SearchConf
 def distinct(targets: Sequence[Targets]) -> list[Target]:
     """Every target once."""
     return list({id(target): target for group in targets for target in group.all}.values())
+
+
+def build_seconds(target: Target) -> float:
+    """What building a target's look-up tables took, s."""
+    return sum(kept.seconds for kept in target.kept.values() if isinstance(kept, Tables))
