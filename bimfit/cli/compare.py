@@ -31,6 +31,7 @@ def run(
 ) -> int:
     """Run the same slices through every method and compare error, time and failures."""
     from bimfit.pipeline.compare import DEFAULT_METHODS, compare, comparison_table, write_comparison
+    from bimfit.pipeline.output import check_folder
 
     names = (
         DEFAULT_METHODS
@@ -39,6 +40,7 @@ def run(
     )
     settings = build_config(config, spacing=spacing)
     pose = None if scan_pose is None else read_pose(scan_pose)
+    check_folder(output)
     with terminal_progress() as progress:
         result = compare(
             model, scan, settings, methods=names, truth=truth, joints=joint, scan_pose=pose, progress=progress

@@ -18,7 +18,9 @@ def run(
 ) -> int:
     """Scan the packaged joint virtually, fit it, measure its gap, and compare methods."""
     from bimfit.pipeline.demo import demo
+    from bimfit.pipeline.output import check_folder
 
+    check_folder(output)
     with terminal_progress() as progress:
         result = demo(output, joints=joints, seed=seed, progress=progress)
     print("Accuracy on the paper's reference scenario\n")

@@ -49,7 +49,7 @@ def run(
     pictures: bool = typer.Option(True, help="Draw pictures."),
 ) -> int:
     """Fit the joints of a model to a scan and write the as-built gap."""
-    from bimfit.pipeline.output import describe, prepare_folder, write_survey
+    from bimfit.pipeline.output import check_folder, describe, write_survey
     from bimfit.pipeline.pictures import write_pictures
     from bimfit.pipeline.survey import survey
 
@@ -57,7 +57,7 @@ def run(
         config, window=window, tolerance=tolerance, spacing=spacing, thickness=thickness, sigma=sigma
     )
     pose = None if scan_pose is None else read_pose(scan_pose)
-    prepare_folder(output)
+    check_folder(output)
     with terminal_progress() as progress:
         result = survey(
             model,

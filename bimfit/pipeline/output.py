@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -70,6 +71,23 @@ def prepare_folder(folder: Path) -> None:
         raise ExportError(
             f"cannot be made: {error.strerror}", file=folder, remedy="choose another -o"
         ) from error
+
+
+def check_folder(folder: Path) -> None:
+    """See that a folder can be written to, before a long run and without making anything.
+
+    Raises
+    ------
+    ExportError
+        When it, or what it would be made in, is a file or may not be written to.
+    """
+    there = folder.absolute()
+    while not there.exists():
+        there = there.parent
+    if not there.is_dir():
+        raise ExportError("is a file, not a folder", file=there, remedy="choose another -o")
+    if not os.access(there, os.W_OK):
+        raise ExportError("may not be written to", file=there, remedy="choose another -o")
 
 
 def safe_name(joint_id: str) -> str:

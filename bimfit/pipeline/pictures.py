@@ -162,7 +162,7 @@ def draw_slice(path: Path, station: StationResult) -> Path:
 
 def draw_tables(path: Path, station: StationResult, config: Config) -> Path:
     """Look-up tables from coarse to fine, with the scan at the best pose of each level (figures 2 to 4)."""
-    edges = matched_edges(station.section, expected_viewpoint(station.slice), config)
+    edges = matched_edges(station.section, expected_viewpoint(station.slice, station.section), config)
     target = make_targets(edges, config).combined
     near = matched_slice(station.slice, config)
     start = near.points

@@ -20,7 +20,7 @@ from bimfit.geometry.pose import Array
 from bimfit.geometry.slice import Slice
 from bimfit.pipeline.fit import check_choice, fit_joint
 from bimfit.pipeline.records import JointResult, SurveyResult
-from bimfit.pipeline.targets import match_reach
+from bimfit.pipeline.targets import match_reach, with_assumed_view
 from bimfit.scan.cloud import PointCloud
 from bimfit.scan.coverage import covers, scan_stations
 from bimfit.scan.slicing import cut_slices
@@ -192,7 +192,8 @@ def cut_joint(
         thickness=config.slices.thickness,
         reach=match_reach(config),
     )
-    return joint, tuple(sections), slices
+    viewed = [with_assumed_view(cut, section) for cut, section in zip(slices, sections, strict=True)]
+    return joint, tuple(sections), tuple(viewed)
 
 
 def viewpoint_of(scan: Scan, joint: Joint) -> Array | None:

@@ -16,12 +16,13 @@ from bimfit.geometry.pose import Array
 from bimfit.geometry.slice import Slice
 from bimfit.geometry.visibility import clip_edges, visible_edges
 from bimfit.registration.table import Tables, Target
+from bimfit.simulation.rangefinder import aim
 
 COMBINED_BREAK_EVEN, COMPONENT_BREAK_EVEN = 80, 800
 """Slices from which on majorant tables pay for themselves, in the wide and in a component's small window."""
 _MARGIN = 0.1
 """How much farther than the components' profiles a scan is used, since they may have moved, m."""
-_FAR_VIEW = 1.0
+_FAR_VIEW, _FREE_VIEW = 1.0, 0.1
 _VIEW_ANGLE = math.radians(2.0)
 _VIEW_RATIO = 1.05
 
@@ -73,7 +74,7 @@ class TargetCache:
 
     def get(self, section: JointSection, slice_: Slice) -> Targets:
         """The targets for a station, made when there are none yet."""
-        viewpoint = expected_viewpoint(slice_)
+        viewpoint = expected_viewpoint(slice_, section)
         key = (*(id(profile) for profile in section.components), *_view_cell(viewpoint))
         if key not in self._known:
             edges = matched_edges(section, viewpoint, self.config, outlines=self.outlines)
@@ -133,9 +134,21 @@ def make_targets(edges: Edges, config: Config, *, outlines: bool = False) -> Tar
     return Targets(Target.of(np.concatenate(edges), blur), (a, b))
 
 
-def expected_viewpoint(slice_: Slice) -> Array:
-    """Where the sensor stood in the section plane; 1 m straight out of the mouth where that is not known."""
-    return np.array([0.0, _FAR_VIEW]) if slice_.viewpoint is None else slice_.viewpoint
+def expected_viewpoint(slice_: Slice, section: JointSection) -> Array:
+    """Where the sensor stood in the section plane; where that is not known, 1 m out of the open side."""
+    return _FAR_VIEW * aim(section, _FREE_VIEW) if slice_.viewpoint is None else slice_.viewpoint
+
+
+def with_assumed_view(slice_: Slice, section: JointSection) -> Slice:
+    """A slice that does not know its sensor, of a joint that cannot be seen straight on.
+
+    A corner or a T is only ever seen from its open side, so that is where the sensor must have been; over a
+    joint that is open all round, the estimate finds or assumes the place by itself.
+    """
+    if slice_.viewpoint is not None:
+        return slice_
+    out = aim(section, _FREE_VIEW)
+    return slice_ if out[0] == 0.0 else dataclasses.replace(slice_, viewpoint=_FAR_VIEW * out)
 
 
 def _view_cell(viewpoint: Array) -> tuple[int, int]:
