@@ -36,6 +36,7 @@ _HOMES = {
     "survey": "bimfit.pipeline.survey",
     "compare": "bimfit.pipeline.compare",
     "simulate": "bimfit.pipeline.simulate",
+    "Scenario": "bimfit.simulation.scenario",
     "write_survey": "bimfit.pipeline.output",
     "write_pictures": "bimfit.pipeline.pictures",
 }
@@ -49,6 +50,7 @@ __all__ = [
     "PointCloud",
     "Pose2D",
     "Profile",
+    "Scenario",
     "SectionFrame",
     "Slice",
     "Target",
@@ -107,3 +109,4 @@ if TYPE_CHECKING:
     from bimfit.registration.table import Target
     from bimfit.scan.cloud import PointCloud
     from bimfit.scan.formats import read_scan, write_scan
+    from bimfit.simulation.scenario import Scenario
