@@ -21,7 +21,7 @@ from bimfit.registration.table import Target
 ITERATIONS = 100
 SPACING = 0.001  # between samples of the model, m
 GATE_SIGMAS = 3.0
-MIN_GATE = 0.03  # correspondences farther apart than this or three blurs are not made, m
+MIN_GATE, MAX_GATE = 0.03, 0.15  # correspondences farther apart are not made, m
 LOST = np.full(3, np.nan)
 Kind = Literal["point", "plane", "robust"]
 
@@ -29,22 +29,22 @@ Kind = Literal["point", "plane", "robust"]
 def icp_point(
     target: Target, slice_: Slice, prior: Pose2D, config: SearchConfig, *, weights: ArrayLike | None = None
 ) -> MatchResult:
-    """Point-to-point ICP (Open3D), started at the prior. ``config`` and ``weights`` are not used."""
-    return _open3d("icp-point", "point", target, slice_, (prior,))
+    """Point-to-point ICP (Open3D), started at the prior; ``config.window`` gates pairs, no weights."""
+    return _open3d("icp-point", "point", target, slice_, (prior,), config)
 
 
 def icp_plane(
     target: Target, slice_: Slice, prior: Pose2D, config: SearchConfig, *, weights: ArrayLike | None = None
 ) -> MatchResult:
-    """Point-to-plane ICP (Open3D), started at the prior. ``config`` and ``weights`` are not used."""
-    return _open3d("icp-plane", "plane", target, slice_, (prior,))
+    """Point-to-plane ICP (Open3D), started at the prior; ``config.window`` gates pairs, no weights."""
+    return _open3d("icp-plane", "plane", target, slice_, (prior,), config)
 
 
 def icp_plane_robust(
     target: Target, slice_: Slice, prior: Pose2D, config: SearchConfig, *, weights: ArrayLike | None = None
 ) -> MatchResult:
     """Point-to-plane ICP with a Tukey kernel of three blurs (Open3D)."""
-    return _open3d("icp-plane-robust", "robust", target, slice_, (prior,))
+    return _open3d("icp-plane-robust", "robust", target, slice_, (prior,), config)
 
 
 def icp_multistart(
@@ -54,7 +54,7 @@ def icp_multistart(
     steps = [(-0.5 * w, 0.0, 0.5 * w) for w in config.window]
     pivot = np.mean(slice_.points, axis=0) if len(slice_.points) else np.zeros(2)
     starts = tuple(Pose2D.about(pivot, *motion) @ prior for motion in itertools.product(*steps))
-    return _open3d("icp-multistart", "plane", target, slice_, starts)
+    return _open3d("icp-multistart", "plane", target, slice_, starts, config)
 
 
 def g_icp(
@@ -75,7 +75,7 @@ def g_icp(
     try:
         found = small_gicp.align(
             _extruded(model, width), _extruded(moved, width), registration_type="GICP",
-            downsampling_resolution=0.0015, max_correspondence_distance=_gate(target),
+            downsampling_resolution=0.0015, max_correspondence_distance=_gate(target, config),
             max_iterations=ITERATIONS,
         )  # fmt: skip
     except Exception as error:  # a library's failure on this slice is a verdict, not a crash
@@ -106,8 +106,10 @@ def _flat(points: Array) -> Array:
     return np.column_stack([points, np.zeros(len(points))])
 
 
-def _gate(target: Target) -> float:
-    return max(MIN_GATE, GATE_SIGMAS * target.blur)
+def _gate(target: Target, config: SearchConfig) -> float:
+    """Farthest correspondence, m: the search's window, so that ICP may come from as far as it does."""
+    window = min(MAX_GATE, max(config.window[:2]))
+    return max(MIN_GATE, GATE_SIGMAS * target.blur, window)
 
 
 def _too_little(name: str, target: Target, slice_: Slice) -> MatchResult | None:
@@ -120,7 +122,9 @@ def _too_little(name: str, target: Target, slice_: Slice) -> MatchResult | None:
     return None
 
 
-def _open3d(name: str, kind: Kind, target: Target, slice_: Slice, starts: tuple[Pose2D, ...]) -> MatchResult:
+def _open3d(
+    name: str, kind: Kind, target: Target, slice_: Slice, starts: tuple[Pose2D, ...], config: SearchConfig
+) -> MatchResult:
     if lost := _too_little(name, target, slice_):
         return lost
     import open3d as o3d
@@ -136,7 +140,9 @@ def _open3d(name: str, kind: Kind, target: Target, slice_: Slice, starts: tuple[
             o3d.utility.Vector3dVector(_flat(start.inverse().apply(slice_.points)))
         )
         try:
-            found = registration.registration_icp(data, model, _gate(target), np.eye(4), estimation, criteria)
+            found = registration.registration_icp(
+                data, model, _gate(target, config), np.eye(4), estimation, criteria
+            )
         except RuntimeError as error:
             failed = MatchResult(name, LOST, status=Status("rejected", f"Open3D: {error}"))
             best = best or failed
