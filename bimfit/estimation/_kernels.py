@@ -17,19 +17,18 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from bimfit._kernels import jit
 from bimfit.geometry.pose import Array
 
 Ints = NDArray[np.int64]
 
 STEEP = 0.3
 NEVER = 1 << 40
-_JIT = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 
-@njit(**_JIT)
+@jit
 def pseudo_angle(x: float, y: float) -> float:
     """Grows with atan2(y, x), from -2 to 2, without trigonometry."""
     size = abs(x) + abs(y)
@@ -41,7 +40,7 @@ def pseudo_angle(x: float, y: float) -> float:
     return 2.0 - q if y >= 0.0 else -2.0 - q
 
 
-@njit(**_JIT)
+@jit
 def _lower(p: Array, lo: int, hi: int, value: float) -> int:
     """First index in [lo, hi) whose p is at least value."""
     while lo < hi:
@@ -53,7 +52,7 @@ def _lower(p: Array, lo: int, hi: int, value: float) -> int:
     return lo
 
 
-@njit(**_JIT)
+@jit
 def _nearer(
     nx: float, ny: float, c: float, e: int, dx: Array, dy: Array, begin: int, end: int, rho: Array, face: Ints
 ) -> None:
@@ -68,7 +67,7 @@ def _nearer(
         face0[k] = e if nearer else face0[k]
 
 
-@njit(**_JIT)
+@jit
 def predict(
     edges: Array,
     cos: float,
@@ -117,7 +116,7 @@ def predict(
                 _nearer(nx, ny, c, e, dx, dy, s, j1, rho, face)
 
 
-@njit(**_JIT)
+@jit
 def sort_beams(
     o: Array, d: Array, group: Ints, count: int, eye: Array, p: Array, order: Ints, start: Ints
 ) -> None:
@@ -151,7 +150,7 @@ def sort_beams(
         p[i] = key[rank[i]]
 
 
-@njit(**_JIT)
+@jit
 def log_table(amplitude: float, scale: float, table: Array) -> None:
     """Fill row 0 with log(1 + a) and row 1 with a / (1 + a), a = A exp(-q / 2), q = index * scale."""
     for i in range(table.shape[1]):
@@ -161,7 +160,7 @@ def log_table(amplitude: float, scale: float, table: Array) -> None:
     table[:, table.shape[1] - 2 :] = 0.0
 
 
-@njit(**_JIT)
+@jit
 def log_likelihood(
     edges: Array,
     pose: Array,
@@ -196,7 +195,7 @@ def log_likelihood(
     return total
 
 
-@njit(**_JIT)
+@jit
 def _total(
     edges: Array,
     cos: float,
@@ -241,7 +240,7 @@ def _total(
     return total
 
 
-@njit(**_JIT)
+@jit
 def normal_equations(
     edges: Array,
     pose: Array,
@@ -329,7 +328,7 @@ def normal_equations(
     H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
 
 
-@njit(**_JIT)
+@jit
 def solve3(H: Array, g: Array, x: Array) -> None:
     """Solve the symmetric positive definite 3 x 3 system H x = g."""
     a, b, c = H[0, 0], H[0, 1], H[0, 2]
@@ -342,7 +341,7 @@ def solve3(H: Array, g: Array, x: Array) -> None:
     x[2] = (C * g[0] + F * g[1] + Z * g[2]) / det
 
 
-@njit(**_JIT)
+@jit
 def slide(
     edges_a: Array,
     edges_b: Array,
@@ -389,7 +388,7 @@ def slide(
         scores[i] = total
 
 
-@njit(**_JIT)
+@jit
 def _pose_at(q0: Array, axes: Array, s: float, w0: float, w1: float, rs: float, out: Array) -> None:
     """Point q0 + s u + w0 v1 + w1 v2 of the scaled coordinates, as (tx, ty, theta)."""
     for i in range(3):
@@ -397,13 +396,13 @@ def _pose_at(q0: Array, axes: Array, s: float, w0: float, w1: float, rs: float, 
     out[2] /= rs
 
 
-@njit(**_JIT)
+@jit
 def _log_prior(pose: Array, prior: Array) -> float:
     value: float = -0.5 * ((pose[0] / prior[0]) ** 2 + (pose[1] / prior[1]) ** 2 + (pose[2] / prior[2]) ** 2)
     return value
 
 
-@njit(**_JIT)
+@jit
 def posterior(
     edges: Array,
     rs: float,
@@ -535,7 +534,7 @@ def posterior(
     )
 
 
-@njit(**_JIT)
+@jit
 def _along(m: Array, axes: Array) -> float:
     """Quadratic form of the first axis."""
     total = 0.0
@@ -545,7 +544,7 @@ def _along(m: Array, axes: Array) -> float:
     return total
 
 
-@njit(**_JIT)
+@jit
 def _pilot(args: tuple[Any, ...], q: Array, rho: Array, face: Ints, H: Array, g: Array, pose: Array) -> None:
     """Six annealed Gauss-Newton steps from q; q becomes the best place passed."""
     edges, rs, p, d, r, start, eye, off, deep, margin, lim, sigma, spread, table, scale, prior, pinv = args
@@ -573,7 +572,7 @@ def _pilot(args: tuple[Any, ...], q: Array, rho: Array, face: Ints, H: Array, g:
         at += x
 
 
-@njit(**_JIT)
+@jit
 def _profile(
     args: tuple[Any, ...], q: Array, axes: Array, step: float, P2: Array, rho: Array, face: Ints, w: Array,
     best: Array,
@@ -600,7 +599,7 @@ def _profile(
     return float(best.max())
 
 
-@njit(**_JIT)
+@jit
 def _two_orientations(edges: Array, face: Ints, r: Array) -> bool:
     """Whether the returns lie on faces that differ by more than 20 degrees."""
     ref = -1
@@ -614,7 +613,7 @@ def _two_orientations(edges: Array, face: Ints, r: Array) -> bool:
     return False
 
 
-@njit(**_JIT)
+@jit
 def _conditional_step(
     args: tuple[Any, ...],
     q: Array,
@@ -657,7 +656,7 @@ def _conditional_step(
     L[1, 1] = math.sqrt(h11 - L[1, 0] * L[1, 0])
 
 
-@njit(**_JIT)
+@jit
 def _integrate(
     args: tuple[Any, ...],
     q: Array,
@@ -780,7 +779,7 @@ def _integrate(
     _rival(values, points, count, total, h, info)
 
 
-@njit(**_JIT)
+@jit
 def _narrowed(
     values: Array, points: Array, count: int, lo: float, h: float, mass: Array
 ) -> tuple[bool, float, float]:
@@ -805,7 +804,7 @@ def _narrowed(
     return True, lo + (first - 1.0) * h, lo + (final + 2.0) * h
 
 
-@njit(**_JIT)
+@jit
 def _rival(values: Array, points: Array, count: int, total: float, h: float, info: Array) -> None:
     """Mass more than 3 mm from the mode along the weak axis, and where most of it lies."""
     cells = int((points[count - 1, 3] - points[0, 3]) / h + 0.5) + 1
@@ -823,7 +822,7 @@ def _rival(values: Array, points: Array, count: int, total: float, h: float, inf
     info[7] = centre / rival if rival > 0.0 else 0.0
 
 
-@njit(**_JIT)
+@jit
 def _sample(
     args: tuple[Any, ...], q: Array, H: Array, axes: Array, draws: Array, mean: Array, cov: Array, info: Array
 ) -> None:
@@ -908,7 +907,7 @@ def _sample(
             info[7] = away
 
 
-@njit(**_JIT)
+@jit
 def _weights(target: Array, before: Array, draws: Array, power: float, w: Array) -> float:
     """Normalised importance weights at a power of the target, and their effective number."""
     top = -np.inf
@@ -925,7 +924,7 @@ def _weights(target: Array, before: Array, draws: Array, power: float, w: Array)
     return total * total / square
 
 
-@njit(**_JIT)
+@jit
 def _moments(x: Array, w: Array, mean: Array, cov: Array) -> None:
     mean[:] = 0.0
     cov[:] = 0.0

@@ -23,6 +23,7 @@ _RIVAL_MASS = 0.2
 _WORTH_NAMING = 0.01
 _INLIERS = 0.5
 _RUN = 6
+_GRAZING = 0.3
 _CUSUM = 2.3
 _CHI2 = 4.0
 _CONTINUES = 4
@@ -40,9 +41,32 @@ def longest_run(flags: Mask) -> int:
     return int((ends - starts).max()) if len(starts) else 0
 
 
-def residuals_of(beams: BeamSet, rho: Array, face: NDArray[np.int64], used: Mask, sigma: float) -> Residuals:
-    """Residual statistics of the beams in ``used`` against predicted ranges (METHOD section 5)."""
-    covered = used & (face >= 0)
+def excused(r: Array, rho: Array, sd: Array, cosine: Array, sigma: float) -> Mask:
+    """Grazing returns that say nothing about the shape: the pose's own uncertainty explains their misfit.
+
+    Parameters
+    ----------
+    sd, cosine : ndarray, shape (n,)
+        From :func:`~bimfit.estimation.likelihood.range_sd`.
+    """
+    with np.errstate(invalid="ignore"):
+        explained = np.abs(r - rho) < 4.0 * np.hypot(sd, sigma)
+    return np.asarray((cosine > -_GRAZING) & (sd > sigma) & (r > 0.0) & explained)
+
+
+def residuals_of(
+    beams: BeamSet, rho: Array, face: NDArray[np.int64], used: Mask, sigma: float, silent: Mask | None = None
+) -> Residuals:
+    """Residual statistics of the beams in ``used`` against predicted ranges (METHOD section 5).
+
+    Those that are ``silent`` (n,) count as beams that meet the component, and as nothing else.
+    """
+    whole = covered = used & (face >= 0)
+    quiet = 0
+    if silent is not None and silent.any():
+        covered = whole & ~silent
+        near = np.abs(beams.r[whole & silent] - rho[whole & silent]) < 4.0 * sigma
+        quiet = int(near.sum())
     n = int(covered.sum())
     r = beams.r[covered]
     e = r - rho[covered]
@@ -54,8 +78,8 @@ def residuals_of(beams: BeamSet, rho: Array, face: NDArray[np.int64], used: Mask
     walk = np.concatenate([[0.0], np.cumsum(z - z.mean())]) if k else np.zeros(1)
     return Residuals(
         n_beams=int(used.sum()),
-        n_covered=n,
-        n_inliers=k,
+        n_covered=n + quiet,
+        n_inliers=k + quiet,
         rms=float(np.sqrt(np.mean(z * z))) if k else float("nan"),
         chi2=float(np.sum(z * z) / sigma**2 / max(k - 2.2, 1.0)) if k else float("nan"),
         outlier_share=float((returned & ~inlier).sum() / n) if n else 0.0,
@@ -64,7 +88,7 @@ def residuals_of(beams: BeamSet, rho: Array, face: NDArray[np.int64], used: Mask
         miss_run=longest_run(~returned),
         cusum=float((walk.max() - walk.min()) / max(float(z.std()), sigma) / math.sqrt(k)) if k > 3 else 0.0,
         lag1=lag,
-        unexplained=_continues(beams, rho, covered, used, sigma),
+        unexplained=_continues(beams, rho, whole, used, sigma),
         edge=_edge_drop(z, face[covered][inlier], sigma),
         residuals=z,
         places=beams.points[covered][inlier],

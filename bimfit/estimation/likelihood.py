@@ -150,6 +150,37 @@ def edge_rows(profile: Profile, pose: Pose2D | None = None) -> Array:
     return np.ascontiguousarray(np.concatenate([edges.reshape(-1, 4), normals], axis=1))
 
 
+def range_sd(
+    rows: Array, beams: BeamSet, rho: Array, face: Ints, pivot: Array, covariance: Array
+) -> tuple[Array, Array]:
+    """How far a pose's own uncertainty moves each predicted range, to first order.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (m, 6)
+        Edges at that pose.
+    pivot, covariance : ndarray, shape (2,) and (3, 3)
+        Of (u, v, theta) of a motion about the pivot.
+
+    Returns
+    -------
+    sd : ndarray, shape (n,)
+        m; g C g^T with g = [n, n x (p - pivot)] / (n.d) (METHOD, section 4, step 5). 0 where nothing is met.
+    cosine : ndarray, shape (n,)
+        n.d, negative; -1 where nothing is met.
+    """
+    k = np.flatnonzero(face >= 0)
+    sd, cosine = np.zeros(len(face)), np.full(len(face), -1.0)
+    n, d = rows[face[k], 4:6], beams.d[:, k].T
+    c = np.minimum((n * d).sum(axis=1), -1e-6)
+    origin = np.repeat(beams.eye[:, :2], np.diff(beams.start), axis=0)[k]
+    arm = origin + d * rho[k, None] - pivot
+    g = np.column_stack([n, n[:, 1] * arm[:, 0] - n[:, 0] * arm[:, 1]]) / c[:, None]
+    sd[k] = np.sqrt(np.maximum(((g @ covariance) * g).sum(axis=1), 0.0))
+    cosine[k] = c
+    return sd, cosine
+
+
 def predict_ranges(rows: Array, beams: BeamSet) -> tuple[Array, Ints]:
     """Range of every beam to the first of the edges that faces it.
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from bimfit.errors import ConfigError
 from bimfit.estimation import trend
+from bimfit.estimation.borrow import at_corner, borrow
 from bimfit.estimation.result import ComponentEstimate, StationEstimate
 from bimfit.estimation.trend import Basis, Sites, Trend
 from bimfit.geometry.joint_section import JointSection
@@ -64,8 +65,10 @@ def estimate_joint(
     Returns
     -------
     JointEstimate
-        Stations without an estimate stay without one. A station that disagrees with its neighbours counts
-        less and is flagged; where its own returns are good in themselves, their estimate is what it keeps.
+        A station without an estimate of its own is given what the model predicts, as ``weak``, where its
+        neighbours are near and the model is sure of it; else it stays without one. A station that disagrees
+        with its neighbours counts less and is flagged; where its own returns are good in themselves, their
+        estimate is what it keeps.
 
     Raises
     ------
@@ -152,7 +155,7 @@ def _sites(estimates: tuple[StationEstimate, ...], sections: Sequence[JointSecti
         if c.pose is None or c.covariance is None or not c.status.measured or not estimate.status.measured:
             continue
         corner = section.gap.mouth[which]
-        J = _at_corner(c.pose, corner)
+        J = at_corner(c.pose, corner)
         x = _motion_of(c.pose, corner)
         total = np.linalg.inv(J @ c.covariance @ J.T)
         alone, at = total, total @ x
@@ -172,12 +175,6 @@ def _sites(estimates: tuple[StationEstimate, ...], sections: Sequence[JointSecti
 
 def _motion_of(pose: Pose2D, corner: Array) -> Array:
     return np.array([*(pose.apply(corner) - corner), pose.theta])
-
-
-def _at_corner(pose: Pose2D, corner: Array) -> Array:
-    """Jacobian of the corner's motion by (u, v, theta) of the pose."""
-    arm = pose.turn(corner)
-    return np.array([[1.0, 0.0, -arm[1]], [0.0, 1.0, arm[0]], [0.0, 0.0, 1.0]])
 
 
 def _find_knots(parts: tuple[Sites, Sites], weights: Sequence[Array]) -> Array:
@@ -283,7 +280,12 @@ def _apply(
     """Stations with the model's poses, and those that disagree with it."""
     out: list[StationEstimate] = []
     outliers: list[tuple[int, str]] = []
+    agreeing = parts[0].known & parts[1].known & (fits[0].distance <= _FLAG) & (fits[1].distance <= _FLAG)
+    borrowed = borrow(stations, sections, parts, fits, agreeing)
     for i, (station, section) in enumerate(zip(stations, sections, strict=True)):
+        if i in borrowed:
+            out.append(borrowed[i])
+            continue
         components: list[ComponentEstimate] = []
         status = station.status
         for which in (0, 1):
@@ -293,7 +295,7 @@ def _apply(
                 continue
             corner = section.gap.mouth[which]
             pose = Pose2D.about(corner, *(float(x) for x in t.value[i]))
-            J = np.linalg.inv(_at_corner(pose, corner))
+            J = np.linalg.inv(at_corner(pose, corner))
             if t.distance[i] > _FLAG:
                 outliers.append((i, "AB"[which]))
                 off = float(np.hypot(*(parts[which].value[i] - t.value[i])[:2])) * 1e3

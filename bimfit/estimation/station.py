@@ -12,7 +12,7 @@ import numpy as np
 from bimfit.config import FitConfig, SensorConfig
 from bimfit.estimation import checks
 from bimfit.estimation.cloud import irregular_sensor, virtual_beams
-from bimfit.estimation.likelihood import BeamModel, BeamSet, edge_rows, predict_ranges
+from bimfit.estimation.likelihood import BeamModel, BeamSet, edge_rows, predict_ranges, range_sd
 from bimfit.estimation.ownership import (
     Cost,
     Ints,
@@ -218,10 +218,7 @@ def _components(
         passed = _through(context, poses, scene)
     if reason:
         posteriors = [p if p is None else _loosened(context, p) for p in posteriors]
-    residuals = [
-        _residuals(context, which, scene, side, usable) if posteriors[which] is not None else Residuals()
-        for which in (0, 1)
-    ]
+    residuals = [_residuals(context, which, scene, side, usable, posteriors[which]) for which in (0, 1)]
     steps = [_corner_step(context, which, poses[which]) for which in (0, 1)]
     return checks.judge_station(
         slice_.s, context.section, slid, (posteriors[0], posteriors[1]), (residuals[0], residuals[1]),
@@ -281,9 +278,15 @@ def _apart(a: Pose2D, b: Pose2D, pivot: Array, sigma: float) -> bool:
     )
 
 
-def _residuals(context: _Context, which: int, scene: Scene, side: Ints, usable: Mask) -> Residuals:
-    beams = context.beams
-    blocked = scene.rho[1 - which] < scene.rho[which]
-    return checks.residuals_of(
-        beams, scene.rho[which], scene.face[which], (side == which) & usable & ~blocked, context.sensor.sigma
-    )
+def _residuals(
+    context: _Context, which: int, scene: Scene, side: Ints, usable: Mask, posterior: Posterior | None
+) -> Residuals:
+    if posterior is None:
+        return Residuals()
+    beams, sigma = context.beams, context.sensor.sigma
+    rho, face = scene.rho[which], scene.face[which]
+    rows = edge_rows(context.section.components[which], posterior.pose)
+    sd, cosine = range_sd(rows, beams, rho, face, posterior.pivot, posterior.pivot_covariance)
+    silent = checks.excused(beams.r, rho, sd, cosine, sigma)
+    blocked = scene.rho[1 - which] < rho
+    return checks.residuals_of(beams, rho, face, (side == which) & usable & ~blocked, sigma, silent)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bimfit.config import FitConfig, SensorConfig
-from bimfit.estimation.checks import longest_run
+from bimfit.estimation.checks import excused, longest_run
 from bimfit.estimation.station import estimate_station
 from bimfit.geometry.pose import Pose2D
 from bimfit.geometry.profile import Profile
@@ -149,6 +149,32 @@ def test_a_clipped_profile_is_not_dragged_to_its_clipped_end():
     assert result.status.name == "ok"
     for c, truth in zip(result.components, (a, b), strict=True):
         assert abs(c.pose.u - truth.u) < 0.0015
+
+
+@pytest.mark.parametrize("seed", [8, 29])
+def test_beams_that_graze_a_deep_gap_do_not_reject_it(seed):
+    """Along a side 2.7 m deep a turn by a milliradian moves ranges by decimetres."""
+    sec = S.butt(gap=0.030, depth=2.7)
+    rng = np.random.default_rng(900 + seed)
+    truth = S.reference_truth(rng, sec, n=2, own=0.004, own_angle=1.0)
+    common, bodies = (
+        truth.common[0],
+        [sec.components[0].moved(truth.a[0]), sec.components[1].moved(truth.b[0])],
+    )
+    look = common.turn((rng.uniform(-0.1, 0.1), -1.0))
+    slice_ = S.scan(rng, bodies, eye=tuple(common.apply((0.0, 0.25))), look=look)
+    result = estimate_station(sec, slice_, S.search_like(rng, common), SensorConfig(), FIT)
+    assert result.status.measured
+    poses = [c.pose for c in result.components]
+    error = S.gap_pose(sec, *poses) - S.gap_pose(sec, truth.a[0], truth.b[0])
+    assert np.hypot(error[0], error[1]) < 2e-3
+
+
+def test_a_grazing_return_is_excused_only_as_far_as_its_pose_is_uncertain():
+    rho, sd = np.full(4, 0.5), np.array([0.02, 0.02, 0.001, 0.02])
+    cosine = np.array([-0.05, -0.05, -0.05, -0.9])
+    r = np.array([0.55, 0.65, 0.55, 0.55])
+    assert excused(r, rho, sd, cosine, 0.003).tolist() == [True, False, False, False]
 
 
 def test_longest_run():
