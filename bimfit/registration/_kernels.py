@@ -7,11 +7,9 @@ No ``fastmath``: it assumes that NaN does not exist.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
-import numba as nb
 import numpy as np
+
+from bimfit._kernels import jit
 
 FULL = 255  # leaf value on the model itself
 LANE = 21  # bits of one of three sums that share a machine word
@@ -25,15 +23,6 @@ EXPANDED = 8  # from here on, nodes expanded of each level; slot 8 counts rows o
 STATE_SIZE = 32
 # what a call of ``search`` ends with
 DONE, TOLERANCE, BUDGET, HEAP_FULL, FOUND_FULL = 0, 1, 2, 3, 4
-
-
-def jit(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile without the interpreter lock; cache on disk where some directory can be written."""
-    try:
-        compiled: Callable[..., Any] = nb.njit(nogil=True, cache=True)(function)
-    except RuntimeError:  # numba found no directory for its cache: a read-only installation
-        compiled = nb.njit(nogil=True)(function)
-    return compiled
 
 
 # ---------------------------------------------------------------- tables

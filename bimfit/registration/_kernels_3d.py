@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from bimfit._kernels import jit, jit_fast
 
 BRICK = 4
 """Blocks an axis in a brick of majorants."""
@@ -20,7 +21,7 @@ _FAINT = 0.06
 """Where the field stays under this a constant serves as its majorant."""
 
 
-@njit(cache=True, nogil=True)
+@jit
 def splat(points, normals, half, sigma, reach, field):
     """Raise ``field`` to the blurred nearness of each sample's tile; all lengths in cells.
 
@@ -59,7 +60,7 @@ def splat(points, normals, half, sigma, reach, field):
                             field[i, j, m] = value
 
 
-@njit(cache=True, nogil=True)
+@jit
 def read(field, x, y, z):
     """Trilinear value of the field at a point in cells; 0 outside."""
     i = math.floor(x)
@@ -84,7 +85,7 @@ def read(field, x, y, z):
     return (a * (1.0 - v) + b * v) * (1.0 - u) + (c * (1.0 - v) + d * v) * u
 
 
-@njit(cache=True, nogil=True)
+@jit
 def mark_bricks(field, radius, block, pad, index):
     """Set ``index`` to 1 for every brick with a block whose region meets the field's support."""
     side = block * BRICK
@@ -116,7 +117,7 @@ def mark_bricks(field, radius, block, pad, index):
                                 index[a, b, c] = 1
 
 
-@njit(cache=True, nogil=True)
+@jit
 def _coordinates(low, high, out):
     """The ends of an interval and the lattice planes between, ascending; returns how many."""
     first = math.floor(low)
@@ -128,7 +129,7 @@ def _coordinates(low, high, out):
     return n
 
 
-@njit(cache=True, nogil=True)
+@jit
 def _region_values(field, cx, cy, cz, nx, ny, nz, values):
     """Field values at the product of three coordinate lists; returns the greatest.
 
@@ -178,7 +179,7 @@ def _region_values(field, cx, cy, cz, nx, ny, nz, values):
 
 
 # Reassociation is safe in the two sums below: their values are finite, and the height is rounded up after.
-@njit(cache=True, nogil=True, fastmath=True)
+@jit_fast
 def _heights(values, cx, cy, cz, nx, ny, nz, mx, my, mz, gx, gy, gz, stride, factors, out):
     """Least A with A + factor g . (y - m) at least the values, for three factors."""
     f0, f1, f2 = factors
@@ -198,7 +199,7 @@ def _heights(values, cx, cy, cz, nx, ny, nz, mx, my, mz, gx, gy, gz, stride, fac
     out[2] = a2
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@jit_fast
 def _height(values, cx, cy, cz, nx, ny, nz, mx, my, mz, gx, gy, gz):
     """Least A with A + g . (y - m) at least the values."""
     top = -1e30
@@ -211,7 +212,7 @@ def _height(values, cx, cy, cz, nx, ny, nz, mx, my, mz, gx, gy, gz):
     return top
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@jit_fast
 def _slopes(values, cx, cy, cz, nx, ny, nz, mx, my, mz, stride):
     """Least-squares slopes of the values about their region's middle."""
     sx = sy = sz = 0.0
@@ -240,7 +241,7 @@ def _slopes(values, cx, cy, cz, nx, ny, nz, mx, my, mz, stride):
     return sx / qx, sy / qy, sz / qz
 
 
-@njit(cache=True, nogil=True)
+@jit
 def fill_bricks(field, radius, block, pad, index, g_scale, records):
     """Compute the majorants of all bricks that ``index`` numbers (0: none) into ``records``.
 
@@ -297,7 +298,7 @@ def fill_bricks(field, radius, block, pad, index, g_scale, records):
                     records[at, 3] = kz
 
 
-@njit(cache=True, nogil=True)
+@jit
 def rotation(w, R, J):
     """Rotation matrix R of a rotation vector and its left Jacobian J."""
     t2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
@@ -324,7 +325,7 @@ def rotation(w, R, J):
         J[i, j] += b * s * w[m]
 
 
-@njit(cache=True, nogil=True)
+@jit
 def score_at(field, points, weights, pivot, pose, R, J):
     """Sum of weighted field values of the points turned by ``pose[3:]`` about the pivot and shifted."""
     rotation(pose[3:], R, J)
@@ -343,7 +344,7 @@ def score_at(field, points, weights, pivot, pose, R, J):
     return total
 
 
-@njit(cache=True, nogil=True)
+@jit
 def pose_of(x0, V, steps, at, pose):
     """Pose (6,) of lattice coordinates ``at`` (d,), which need not be whole."""
     for i in range(6):
@@ -352,7 +353,7 @@ def pose_of(x0, V, steps, at, pose):
             pose[i] += V[i, j] * steps[j] * at[j]
 
 
-@njit(cache=True, nogil=True)
+@jit
 def bound_node(points, rho, weights, pivot, pose, half, V, tables, R, J, slope):
     """Upper bound of the score over a box of poses around ``pose``.
 
@@ -457,7 +458,7 @@ def bound_node(points, rho, weights, pivot, pose, half, V, tables, R, J, slope):
     return base
 
 
-@njit(cache=True, nogil=True)
+@jit
 def climb(field, points, weights, pivot, x0, V, steps, reach, at, first):
     """Climb on the lattice from ``at`` (d,) by steps of ``first`` down to 1; returns score, evaluations."""
     R = np.empty((3, 3))
@@ -491,13 +492,13 @@ def climb(field, points, weights, pivot, x0, V, steps, reach, at, first):
     return best, count
 
 
-@njit(cache=True, nogil=True)
+@jit
 def _before(keys, a, b):
     """Whether node a comes before b: the greater bound, then the lesser slot."""
     return keys[a] > keys[b] or (keys[a] == keys[b] and a < b)
 
 
-@njit(cache=True, nogil=True)
+@jit
 def push(heap, keys, size, node):
     """Add a node to the heap; returns the new size."""
     i = size
@@ -511,7 +512,7 @@ def push(heap, keys, size, node):
     return size + 1
 
 
-@njit(cache=True, nogil=True)
+@jit
 def pop(heap, keys, size):
     """Take the first node off the heap; returns (node, new size)."""
     first = heap[0]
@@ -532,7 +533,7 @@ def pop(heap, keys, size):
     return first, size
 
 
-@njit(cache=True, nogil=True)
+@jit
 def _in_zone(low, high, node, zones, count, zone_half):
     """Whether a node lies wholly in the neighbourhood of a mode that is known."""
     for m in range(count):
@@ -546,7 +547,7 @@ def _in_zone(low, high, node, zones, count, zone_half):
     return False
 
 
-@njit(cache=True, nogil=True)
+@jit
 def search(problem, tables, nodes, state, best_at, motion, settings, zones, zone_half):
     """Branch and bound, best first, until proven, out of budget, or out of room for nodes.
 

@@ -1,0 +1,30 @@
+"""How every kernel is compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numba as nb
+
+
+def jit(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile without the interpreter lock; cache on disk where some directory can be written.
+
+    Division by zero gives inf or NaN as in NumPy, instead of an exception from inside a kernel.
+    """
+    return _compiled(function, fastmath=False)
+
+
+def jit_fast(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same with fast arithmetic: only for kernels that never see an inf or a NaN."""
+    return _compiled(function, fastmath=True)
+
+
+def _compiled(function: Callable[..., Any], *, fastmath: bool) -> Callable[..., Any]:
+    options = {"nogil": True, "error_model": "numpy", "fastmath": fastmath}
+    try:
+        compiled: Callable[..., Any] = nb.njit(cache=True, **options)(function)
+    except RuntimeError:  # numba found no directory for its cache: a read-only installation
+        compiled = nb.njit(**options)(function)
+    return compiled

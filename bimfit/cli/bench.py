@@ -1,0 +1,33 @@
+"""``bimfit bench``: the published tables, made again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import typer
+
+from bimfit.cli.progress import terminal_progress
+
+
+def run(
+    suite: str = typer.Option("accuracy", "--suite", metavar="NAME", help="accuracy, matcher or matcher-3d."),
+    joints: int = typer.Option(100, "--joints", min=1, help="Random joints (matcher-3d: starts)."),
+    seed: int = typer.Option(1000, "--seed", min=0, help="Seed of the first joint."),
+    json_file: Path | None = typer.Option(
+        None, "--json", metavar="FILE", help="Write the figures there, too."
+    ),
+) -> int:
+    """Measure accuracy and speed on the reference scenario and print the tables."""
+    from bimfit.errors import ConfigError
+    from bimfit.files import write_text
+    from bimfit.pipeline.bench import SUITES, bench
+    from bimfit.pipeline.results import to_json
+
+    if suite not in SUITES:
+        raise ConfigError(f"unknown suite {suite}", remedy=f"choose from {', '.join(SUITES)}")
+    with terminal_progress() as progress:
+        result = bench(suite, joints=joints, seed=seed, progress=progress)
+    if json_file is not None:
+        write_text(json_file, to_json({"suite": suite, "joints": joints, "seed": seed, **result.data}))
+    print(result.text)
+    return 0
