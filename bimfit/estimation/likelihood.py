@@ -90,10 +90,14 @@ class BeamSet:
 
     @classmethod
     def of(cls, beams: Beams) -> BeamSet:
-        """Sort the beams of a slice."""
-        o = np.ascontiguousarray(beams.origins, np.float64)
-        d = np.ascontiguousarray(beams.directions, np.float64)
-        r = np.where(np.isfinite(beams.ranges), beams.ranges, _MISSING)
+        """Sort the beams of a slice; one whose origin or direction is not a number is left out."""
+        whole = np.flatnonzero(
+            np.isfinite(beams.origins).all(axis=1) & np.isfinite(beams.directions).all(axis=1)
+        )
+        o = np.ascontiguousarray(beams.origins[whole], np.float64)
+        d = np.ascontiguousarray(beams.directions[whole], np.float64)
+        r = beams.ranges[whole]
+        r = np.where(np.isfinite(r), r, _MISSING)
         n = len(r)
         group = np.zeros(n, np.int64)
         if n and float(np.abs(o - o[0]).max()) > 1e-7:
@@ -105,7 +109,8 @@ class BeamSet:
         order = np.empty(n, np.int64)
         start = np.zeros(count + 1, np.int64)
         _kernels.sort_beams(o, d, group, count, eye, p, order, start)
-        return cls(p, np.ascontiguousarray(d[order].T), np.ascontiguousarray(r[order]), start, eye, order)
+        sorted_d = np.ascontiguousarray(d[order].T)
+        return cls(p, sorted_d, np.ascontiguousarray(r[order]), start, eye, whole[order])
 
     def __len__(self) -> int:
         return len(self.p)

@@ -84,9 +84,12 @@ def estimate_station(
     StationEstimate
         Always; what could not be measured has a status that says why and no pose.
     """
-    if len(slice_.points) < fit.min_points:
-        reason = f"{len(slice_.points)} returns in the slice, {fit.min_points} are needed"
+    finite = np.isfinite(slice_.points).all(axis=1)
+    if int(finite.sum()) < fit.min_points:
+        reason = f"{int(finite.sum())} returns in the slice, {fit.min_points} are needed"
         return _nothing(section, slice_, combined, sensor, Status("no_data", reason))
+    if not finite.all():
+        slice_ = dataclasses.replace(slice_, points=slice_.points[finite])
     if section.components[0].empty or section.components[1].empty:
         return _nothing(
             section, slice_, combined, sensor, Status("no_data", "the section plane misses a component")
@@ -95,6 +98,34 @@ def estimate_station(
         return _nothing(
             section, slice_, None, sensor, Status("rejected", "the search found no pose of the joint")
         )
+    try:
+        best = _estimated(section, slice_, combined, sensor, fit, component_matches, rivals)
+    except np.linalg.LinAlgError as error:
+        reason = f"the returns do not determine a pose: {error}"
+        return _nothing(section, slice_, combined, sensor, Status("rejected", reason))
+    if not all(_finite(c) for c in best.components):
+        reason = "the returns do not determine a pose: its figures are not finite"
+        return _nothing(section, slice_, combined, sensor, Status("rejected", reason))
+    return best
+
+
+def _finite(c: ComponentEstimate) -> bool:
+    """Whether a component's figures, if it has any, are numbers."""
+    if c.pose is None or c.covariance is None:
+        return True
+    return bool(np.isfinite(c.pose.as_array()).all() and np.isfinite(c.covariance).all())
+
+
+def _estimated(
+    section: JointSection,
+    slice_: Slice,
+    combined: Pose2D,
+    sensor: SensorConfig,
+    fit: FitConfig,
+    component_matches: tuple[Pose2D | None, Pose2D | None],
+    rivals: Sequence[Pose2D],
+) -> StationEstimate:
+    """The estimate of a slice that has enough returns and a combined pose."""
     virtual = None
     if slice_.beams is None or len(slice_.beams.ranges) == 0:
         virtual = virtual_beams(slice_, section, combined, sensor)

@@ -7,10 +7,12 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from bimfit.config import FitConfig, SensorConfig
 from bimfit.estimation.station import estimate_station
-from bimfit.geometry.slice import Slice
+from bimfit.geometry.pose import Pose2D
+from bimfit.geometry.slice import Beams, Slice
 
 
 def _scenario():
@@ -62,3 +64,68 @@ def test_empty_slice_and_failed_search_are_values():
     rng = np.random.default_rng(0)
     slice_ = S.scan(rng, sec.components)
     assert estimate_station(sec, slice_, None, SensorConfig(), FitConfig()).status.name == "rejected"
+
+
+def _degenerate(kind, beams, rng):
+    """Beams that no sensor should deliver, and some do."""
+    o, d, r = beams.origins.copy(), beams.directions.copy(), beams.ranges.copy()
+    n = len(r)
+    if kind == "random":
+        r = rng.uniform(0.0, 5.0, n)
+    elif kind == "few":
+        r[:] = np.nan
+        r[rng.integers(n, size=rng.integers(1, 9))] = 0.25
+    elif kind == "missing":
+        r[:] = np.nan
+    elif kind == "duplicated":
+        o, d, r = np.repeat(o[80:82], 40, axis=0), np.repeat(d[80:82], 40, axis=0), np.full(80, 0.25)
+    elif kind == "nan":
+        o[3], d[7] = np.nan, np.nan
+    elif kind == "inside":
+        o[:] = (0.05, -0.01)
+        r = rng.uniform(0.001, 0.1, n)
+    elif kind == "zero":
+        r[:] = 0.0
+    elif kind == "far":
+        r += 1e4
+    return Beams(o, d, r)
+
+
+@pytest.mark.parametrize("kind", ["random", "few", "missing", "duplicated", "nan", "inside", "zero", "far"])
+def test_degenerate_slices_are_values_with_a_reason_and_never_ok(kind):
+    designs = (S.butt(), S.groove(), S.butt(gap=0.001), S.butt(gap=0.030, depth=2.7))
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        sec = designs[seed % 4]
+        beams = _degenerate(kind, S.scan(rng, sec.components).beams, rng)
+        known = beams if rng.random() < 0.7 else None
+        start, other = Pose2D(*rng.normal(0.0, 0.02, 3)), Pose2D(*rng.normal(0.0, 0.02, 3))
+        result = estimate_station(
+            sec, Slice(0.0, beams.points, known), start, SensorConfig(), FitConfig(),
+            component_matches=(other, None),
+        )  # fmt: skip
+        assert kind == "nan" or (result.status.name != "ok" and result.status.reason)
+        for c in result.components:
+            assert c.pose is None or np.isfinite(c.pose.as_array()).all()
+            assert c.covariance is None or np.isfinite(c.covariance).all()
+
+
+def test_a_beam_that_is_not_a_number_costs_no_other():
+    sec = S.butt()
+    slice_ = S.scan(np.random.default_rng(2), sec.components)
+    beams = _degenerate("nan", slice_.beams, None)
+    result = estimate_station(sec, Slice(0.0, beams.points, beams), Pose2D(), SensorConfig(), FitConfig())
+    assert result.status.name == "ok"
+    assert all(abs(c.pose.u) < 2e-3 and abs(c.pose.v) < 2e-3 for c in result.components)
+
+
+def test_a_singular_matrix_is_a_rejection(monkeypatch):
+    def singular(*_args, **_named):
+        raise np.linalg.LinAlgError("Matrix is not positive definite.")
+
+    monkeypatch.setattr("bimfit.estimation.station.component_posterior", singular)
+    sec = S.butt()
+    slice_ = S.scan(np.random.default_rng(2), sec.components)
+    result = estimate_station(sec, slice_, Pose2D(), SensorConfig(), FitConfig())
+    assert result.status.name == "rejected"
+    assert "not positive definite" in result.status.reason
