@@ -47,8 +47,10 @@ def run(
     ),
     config: Path | None = typer.Option(None, "--config", metavar="FILE.toml", help="Settings."),
     pictures: bool = typer.Option(True, help="Draw pictures."),
+    as_built: bool = typer.Option(True, help="Write the model with the gaps as as-built.ifc."),
 ) -> int:
     """Fit the joints of a model to a scan and write the as-built gap."""
+    from bimfit.pipeline.as_built import try_write_model
     from bimfit.pipeline.output import check_folder, describe, write_survey
     from bimfit.pipeline.pictures import write_pictures
     from bimfit.pipeline.survey import survey
@@ -58,6 +60,7 @@ def run(
     )
     pose = None if scan_pose is None else read_pose(scan_pose)
     check_folder(output)
+    unwritten = ""
     with terminal_progress() as progress:
         result = survey(
             model,
@@ -71,11 +74,16 @@ def run(
         )
         progress("writing", 0.0)
         write_survey(result, output)
+        if as_built:
+            progress("writing the as-built model", 0.0)
+            unwritten = try_write_model(result, output)
         if pictures:
             write_pictures(result, output)
     for one in result.joints:
         print(describe(one))
     print(f"results in {output}")
+    if unwritten:
+        print(f"bimfit: note: no as-built.ifc: {unwritten}", file=sys.stderr)
     for note in result.notes:
         print(f"bimfit: note: {note}", file=sys.stderr)
     for one in result.failed:

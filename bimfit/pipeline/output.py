@@ -46,7 +46,7 @@ def write_survey(
     meshes = {j.joint.id: j.mesh for j in survey.joints if j.mesh is not None}
     planned = [folder / f"gap-{safe_name(i)}.{f}" for i in meshes for f in formats]
     planned += [folder / "results.json", folder / "stations.csv"]
-    protect_inputs(planned, (survey.model, survey.scan))
+    protect_inputs([*planned, folder / "as-built.ifc"], (survey.model, survey.scan))
     stale = _earlier_files(folder) - set(planned)
     files = {i: _write_meshes(i, mesh, folder, formats) for i, mesh in meshes.items()}
     write_text(folder / "stations.csv", stations_to_csv(survey.joints))

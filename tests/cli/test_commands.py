@@ -161,6 +161,20 @@ def test_stations_csv_has_a_row_a_station(results):
             assert row["width_mouth_m"] == ""
 
 
+def test_as_built_model_holds_the_gap(results, model):
+    import ifcopenshell
+
+    file = ifcopenshell.open(str(results / "as-built.ifc"))
+    joint = json.loads((results / "results.json").read_text())["joints"][0]
+    (gap,) = file.by_type("IfcVirtualElement")
+    ties = {t.RelatingElement.GlobalId for t in file.by_type("IfcRelConnectsElements")}
+    ties |= {t.RelatedElement.GlobalId for t in file.by_type("IfcRelConnectsElements")}
+    assert set(joint["elements"]) <= ties
+    assert gap.Representation is not None
+    before = {e.GlobalId for e in ifcopenshell.open(str(model)).by_type("IfcRoot")}
+    assert before <= {e.GlobalId for e in file.by_type("IfcRoot")}
+
+
 def test_pictures_are_drawn(results):
     pictures = sorted(path.name.split("-")[0] for path in results.glob("*.png"))
     assert pictures == ["gap", "scene", "slice", "tables"]

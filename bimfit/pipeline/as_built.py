@@ -1,0 +1,73 @@
+"""The as-built gaps written back into the building model."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from bimfit.bim.as_built import AsBuiltGap, write_as_built
+from bimfit.errors import BimfitError
+from bimfit.pipeline.records import JointResult, SurveyResult
+
+NAME = "as-built.ifc"
+
+
+def write_model(survey: SurveyResult, folder: Path) -> Path:
+    """Write the survey's model with a virtual element for each joint into ``folder``.
+
+    Raises
+    ------
+    BimfitError
+        When the model cannot be written back, or the file cannot be written.
+    """
+    return write_as_built(survey.model, [as_built_gap(joint) for joint in survey.joints], folder / NAME)
+
+
+def try_write_model(survey: SurveyResult, folder: Path) -> str:
+    """Write the as-built model, or say why that cannot be; the other results stand either way."""
+    try:
+        write_model(survey, folder)
+    except BimfitError as error:
+        return str(error)
+    return ""
+
+
+def as_built_gap(result: JointResult) -> AsBuiltGap:
+    """A joint's figures in plain values; None where nothing was measured."""
+    joint = result.joint
+    first, second = sorted(joint.elements)
+    gaps = [station.gap for station in result.stations if station.gap is not None]
+    nothing = AsBuiltGap(
+        id=joint.id,
+        kind=joint.kind,
+        elements=(first, second),
+        status="not estimated",
+        designed_width=joint.width,
+        reason=result.reason,
+        stations=len(result.stations),
+        measured=len(gaps),
+    )
+    if not gaps:
+        return nothing
+    widths = np.array([gap.width_mouth for gap in gaps])
+    sigmas = np.array([gap.sigma.width for gap in gaps if gap.sigma is not None])
+    volumes = result.volumes
+    flagged = sum(station.status.name != "ok" for station in result.stations)
+    return dataclasses.replace(
+        nothing,
+        status="ok" if not flagged else "flagged",
+        reason=""
+        if not flagged
+        else f"{flagged} of {len(result.stations)} stations are not ok; see results.json",
+        width_min=float(widths.min()),
+        width_mean=float(widths.mean()),
+        width_max=float(widths.max()),
+        width_sigma=float(np.sqrt(np.mean(sigmas**2))) if len(sigmas) else None,
+        length=joint.length,
+        area=float(np.mean([gap.area for gap in gaps])),
+        volume=None if volumes is None else volumes.mesh,
+        volume_sigma=None if volumes is None else volumes.sigma,
+        mesh=None if result.mesh is None else result.mesh.triangles,
+    )
