@@ -1,7 +1,7 @@
 # Sourced by scripts/demo and scripts/test: leaves a ready .venv, or stops with one line that says what to do.
 # shellcheck shell=bash
 set -euo pipefail
-ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
+ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd -P)"
 cd "$ROOT"
 
 say() { printf 'bimfit: %s\n' "$*" >&2; }
@@ -36,41 +36,58 @@ find_python() {
     done
 }
 
-# What Open3D and VTK load from the system (on Linux; elsewhere their wheels bring all).
-check_libraries() {
+# What Open3D and VTK load from the system (on Linux; elsewhere their wheels bring all), as library:package.
+LIBRARIES=(libusb-1.0.so.0:libusb-1.0-0 libGL.so.1:libgl1 libgomp.so.1:libgomp1 libX11.so.6:libx11-6 libEGL.so.1:libegl1)
+
+# The packages that the given Python lacks to make .venv and to load the libraries; one a line.
+missing_packages() {
+    local python="$1" pair
+    sound_environment || "$python" -c 'import ensurepip, venv' >/dev/null 2>&1 ||
+        "$python" -c 'import sys; print("python%d.%d-venv" % sys.version_info[:2])'
     [ "$(uname -s)" = Linux ] || return 0
-    local python="$1" missing=() pair
-    for pair in libusb-1.0.so.0:libusb-1.0-0 libGL.so.1:libgl1 libgomp.so.1:libgomp1 libX11.so.6:libx11-6 libEGL.so.1:libegl1; do
-        "$python" -c 'import ctypes, sys; ctypes.CDLL(sys.argv[1])' "${pair%%:*}" >/dev/null 2>&1 || missing+=("${pair##*:}")
+    for pair in "${LIBRARIES[@]}"; do
+        "$python" -c 'import ctypes, sys; ctypes.CDLL(sys.argv[1])' "${pair%%:*}" >/dev/null 2>&1 || echo "${pair##*:}"
     done
-    [ ${#missing[@]} = 0 ] || system_packages "${missing[@]}"
+}
+
+# Whether .venv can be kept: no install was cut off in it, it runs, and it was made in this very folder.
+sound_environment() {
+    [ ! -e .venv/.installing ] && [ -f .venv/bin/pip ] && grep -qF "$ROOT/.venv/bin/" .venv/bin/pip &&
+        .venv/bin/python -c 'import sys, pip; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1
 }
 
 make_environment() {
-    local python stamp want
+    local python missing want
     python="$(find_python)"
     if [ -z "$python" ]; then
-        system_packages python3 python3-venv
+        ! command -v python3 >/dev/null 2>&1 ||
+            die "needs Python 3.11 or newer, and this is $(python3 --version 2>&1); install python3.11 and python3.11-venv, or newer"
+        system_packages python3 python3-venv "${LIBRARIES[@]##*:}"
         python="$(find_python)"
         [ -n "$python" ] || die "needs Python 3.11 or newer; this system's python3 is older"
     fi
-    check_libraries "$python"
-    stamp=".venv/.installed"
+    missing="$(missing_packages "$python")"
+    # shellcheck disable=SC2086  # one word a package
+    [ -z "$missing" ] || system_packages $missing
     want="$("$python" -c 'import hashlib, pathlib, sys; print(hashlib.sha256(pathlib.Path("pyproject.toml").read_bytes() + sys.version.encode() + str(pathlib.Path.cwd()).encode()).hexdigest())')"
-    if [ -x .venv/bin/python ] && [ -f "$stamp" ] && [ "$(cat "$stamp")" = "$want" ]; then
+    if [ -x .venv/bin/python ] && [ -f .venv/.installed ] && [ "$(cat .venv/.installed)" = "$want" ]; then
         return
     fi
-    if ! "$python" -c 'import ensurepip, venv' >/dev/null 2>&1; then
-        system_packages python3-venv
-    fi
-    if ! .venv/bin/python -c 'import sys, pip; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; then
+    if ! sound_environment; then
         say "making .venv with $("$python" --version)"
         "$python" -m venv --clear .venv || die "could not make .venv; is the disk full, or the folder read-only?"
     fi
-    say "installing bimfit and what it needs into .venv (about 2 GB, a few minutes the first time)"
+    say "installing bimfit and what it needs into .venv (about 3 GB, a few minutes the first time)"
+    rm -f .venv/.installed
+    : >.venv/.installing
     .venv/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]' ||
         die "pip could not install the packages; the lines above say why (a network or a proxy, most often)"
-    printf '%s\n' "$want" >"$stamp"
+    rm .venv/.installing
+    printf '%s\n' "$want" >.venv/.installed
 }
 
-make_environment
+# One at a time: a second run waits until the first has installed.
+(
+    if command -v flock >/dev/null 2>&1; then flock 9; fi
+    make_environment
+) 9<pyproject.toml
