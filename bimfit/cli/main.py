@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import typer
 
 from bimfit import __version__
-from bimfit.cli import bench, compare, demo, fit, joints, simulate, view
+from bimfit.cli import bench, capture, compare, demo, emulate, fit, joints, live, simulate, view
 from bimfit.errors import BimfitError
 
 DONE, PARTLY, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -29,6 +29,9 @@ app.command("joints")(joints.run)
 app.command("fit")(fit.run)
 app.command("compare")(compare.run)
 app.command("simulate")(simulate.run)
+app.command("capture")(capture.run)
+app.command("emulate")(emulate.run)
+app.command("live")(live.run)
 app.command("view")(view.run)
 app.command("bench")(bench.run)
 

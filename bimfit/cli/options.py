@@ -33,6 +33,28 @@ def length(text: str, option: str) -> float:
     return value
 
 
+def angle(text: str, option: str) -> float:
+    """An angle such as ``30deg`` or ``0.5`` in radians.
+
+    Raises
+    ------
+    ConfigError
+        Naming the option, when it is no angle.
+    """
+    return _quantity(text, option, _ANGLES, "30deg")
+
+
+def speed(text: str, option: str = "--speed") -> float:
+    """A speed such as ``0.05``, ``50mm`` or ``50mm/s`` in metres a second.
+
+    Raises
+    ------
+    ConfigError
+        Naming the option, when it is no speed.
+    """
+    return length(text.removesuffix("/s"), option)
+
+
 def pose_triple(text: str, option: str) -> Triple:
     """Three numbers ``u,v,theta`` as metres and radians, each with an optional unit (mm, cm, m; rad, deg).
 

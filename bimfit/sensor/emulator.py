@@ -131,6 +131,11 @@ class Emulator:
         return self._device.laser
 
     @property
+    def running(self) -> bool:
+        """Whether it serves: from the start until it is stopped or the scene fails."""
+        return self._thread is not None and self._thread.is_alive()
+
+    @property
     def seconds(self) -> float:
         """Emulated seconds since the start."""
         return self._now()

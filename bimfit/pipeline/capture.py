@@ -1,0 +1,152 @@
+"""Record a rangefinder: sweeps until enough, until interrupted, or until the device is gone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from bimfit.errors import BimfitError, ConfigError, ExportError, SensorError
+from bimfit.files import whole_file
+from bimfit.geometry.line_scan import LineScan
+from bimfit.geometry.pose import Array
+from bimfit.pipeline.carriage import advanced
+from bimfit.scan.formats import FORMATS, write_scan
+from bimfit.sensor.counters import Counters
+from bimfit.sensor.hokuyo import Hokuyo
+from bimfit.sensor.sweep import Sweep, line_scan
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What was recorded.
+
+    Attributes
+    ----------
+    scan : LineScan
+        With the columns ``time`` (s since 1970, of every beam), ``code`` (what the device sent), ``step``
+        and ``stamp`` (the device's clock at the sweep's start, s).
+    sweeps : int
+    counters : Counters
+        What went wrong meanwhile.
+    interrupted : bool
+        Whether it ended by Ctrl-C or SIGTERM.
+    failure : BimfitError or None
+        Why it ended before its time, where the device gave up.
+    """
+
+    scan: LineScan
+    sweeps: int
+    counters: Counters
+    interrupted: bool = False
+    failure: BimfitError | None = None
+
+
+def record(
+    port: str | None,
+    *,
+    sweeps: int | None = None,
+    seconds: float | None = None,
+    field: float | None = None,
+    speed: float = 0.0,
+    pose: Array | None = None,
+    told: Callable[[int], None] = lambda count: None,
+) -> Recording:
+    """Record sweeps; the laser is off afterwards, whatever happens.
+
+    Parameters
+    ----------
+    port : str, optional
+        None takes the one Hokuyo that is plugged in.
+    sweeps, seconds : optional
+        When to end; whichever comes first, else never.
+    field : float, optional
+        Half opening about straight ahead that is recorded, rad; all of it by default.
+    speed : float
+        Of the sensor along its own z axis, m/s, from the first sweep on.
+    pose : ndarray, shape (4, 4), optional
+        T_world_sensor at the first sweep; the sensor's own coordinates by default.
+    told : callable
+        Told the number of sweeps so far.
+
+    Raises
+    ------
+    SensorError
+        When the device cannot be reached, or not one whole sweep came. Later failures end the recording.
+    """
+    kept: list[Sweep] = []
+    interrupted, failure = False, None
+    device = Hokuyo(port)
+    try:
+        with device:
+            start, end = (None, None) if field is None else device.parameters.steps(-field, field)
+            with closing(device.scans(start, end, count=sweeps)) as stream:  # type: ignore[type-var]
+                for sweep in stream:
+                    kept.append(sweep)
+                    told(len(kept))
+                    if seconds is not None and sweep.stamp_host - kept[0].stamp_host >= seconds:
+                        break
+    except KeyboardInterrupt:
+        interrupted = True
+    except SensorError as error:
+        if not kept:
+            raise
+        failure = error
+    if not kept:
+        raise SensorError("interrupted before the first whole sweep came; nothing is written")
+    return Recording(_laid_out(kept, speed, pose), len(kept), device.counters, interrupted, failure)
+
+
+def _laid_out(kept: list[Sweep], speed: float, pose: Array | None) -> LineScan:
+    first = float(kept[0].times[0])
+    at = np.eye(4) if pose is None else pose
+    scan = line_scan(kept, lambda times: advanced(at, speed * (times - first)), "rangefinder")
+    columns = {
+        "step": np.concatenate([sweep.steps for sweep in kept]),
+        "stamp": np.concatenate([np.full(sweep.steps.size, sweep.stamp_device) for sweep in kept]),
+    }
+    return replace(scan, extra={**scan.extra, **columns})
+
+
+class _Probed(Exception):
+    """The file could be written."""
+
+
+def check_output(path: Path) -> None:
+    """Find out, before anything is recorded, whether a line scan can be written there.
+
+    Raises
+    ------
+    ExportError
+        When its extension names no format of line scans, or its folder cannot be written to.
+    """
+    able = [extension for form in FORMATS if form.beams for extension in form.extensions]
+    if path.suffix.lower() not in able:
+        raise ExportError(
+            f"a line scan cannot be written as {path.suffix or 'a file without extension'}",
+            file=path,
+            remedy=f"use {', '.join(able)}",
+        )
+    try:
+        with whole_file(path) as part:
+            write_scan(LineScan.of([], [], [], []), part)
+            raise _Probed
+    except _Probed:
+        pass
+
+
+def check_length(sweeps: int | None, seconds: float | None) -> None:
+    """Refuse recordings of no length.
+
+    Raises
+    ------
+    ConfigError
+        For a duration that is not positive.
+    """
+    if seconds is not None and not seconds > 0.0:
+        raise ConfigError(f"--seconds {seconds:g}: must be more than 0")
+    if sweeps is not None and sweeps < 1:
+        raise ConfigError(f"--sweeps {sweeps}: must be at least 1")

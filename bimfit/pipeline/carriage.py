@@ -1,0 +1,44 @@
+"""Where a rangefinder is while it is carried along a joint: x ahead, y left, z up, as the device counts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from bimfit.geometry.joint_section import JointSection
+from bimfit.geometry.line_scan import LineScan
+from bimfit.geometry.pose import Array
+from bimfit.simulation.rangefinder import aim
+
+
+def held_over(section: JointSection, height: float) -> Array:
+    """T_world_sensor (4, 4) of a sensor held at ``height`` (m) over the designed mouth, looking into it.
+
+    Its plane is the section's, and it is turned so that its z axis points along the joint, and bearings
+    grow from A towards B.
+    """
+    out = aim(section, height)
+    axes = np.array([-out, [out[1], -out[0]]])
+    ahead, left = section.frame.direction_to_world(axes)
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([ahead, left, section.frame.n])
+    T[:3, 3] = section.frame.to_world(height * out)
+    return T
+
+
+def advanced(T_world_sensor: Array, distances: Array) -> Array:
+    """Poses (n, 4, 4) of a sensor that went so far (n,), m, along its own z axis."""
+    poses = np.repeat(T_world_sensor[None], len(distances), axis=0)
+    poses[:, :3, 3] += np.asarray(distances)[:, None] * T_world_sensor[:3, 2]
+    return poses
+
+
+def carried(scan: LineScan, poses: Array) -> LineScan:
+    """A scan in the sensor's own coordinates, laid out in the world by one pose (n, 4, 4) a beam."""
+    turns = poses[:, :3, :3]
+    return replace(
+        scan,
+        origins=np.einsum("nij,nj->ni", turns, scan.origins) + poses[:, :3, 3],
+        directions=np.einsum("nij,nj->ni", turns, scan.directions),
+    )

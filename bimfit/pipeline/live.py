@@ -1,0 +1,338 @@
+"""Fit a joint sweep by sweep while it is being measured."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bimfit.bim.stations import design_sections
+from bimfit.config import Config
+from bimfit.errors import ConfigError, ScanError
+from bimfit.gap.section import GapSection, gap_section
+from bimfit.geometry.joint_section import JointSection
+from bimfit.geometry.line_scan import LineScan
+from bimfit.geometry.pose import Array
+from bimfit.geometry.status import Status
+from bimfit.pipeline.carriage import advanced, carried, held_over
+from bimfit.pipeline.fit import fit_station
+from bimfit.pipeline.simulate import designed, longest_open
+from bimfit.pipeline.survey import load_scan, model_joints, mouth_paths, viewpoint_of
+from bimfit.pipeline.targets import TargetCache, match_reach, with_assumed_view
+from bimfit.scan.coverage import covers, sweep_positions
+from bimfit.scan.grid import StationGrid
+from bimfit.scan.slicing import cut_slices
+from bimfit.sensor.clock import SCAN_DELAY, host_clock
+from bimfit.sensor.counters import Counters
+from bimfit.sensor.hokuyo import Hokuyo
+from bimfit.sensor.sweep import line_scan
+from bimfit.simulation.motion import random_truth
+from bimfit.simulation.rangefinder import simulate_scan
+from bimfit.simulation.scenario import Scenario
+
+if TYPE_CHECKING:
+    from bimfit.bim.joint import Joint
+    from bimfit.bim.model import Model
+
+NEAR = 0.3
+SWEEPS = 1000
+"""So many sweeps are prepared for: building the faster look-up tables pays."""
+_STEP = 0.01
+
+
+@dataclass(frozen=True)
+class LiveStation:
+    """What one sweep says.
+
+    Attributes
+    ----------
+    index : int
+        The sweep's number.
+    s : float
+        Where along the joint it is, m; NaN where it does not cross it.
+    status : Status
+    gap : GapSection or None
+        None where it could not be measured.
+    latency : float
+        From the sweep's last byte to here, s; NaN of a recording.
+    """
+
+    index: int
+    s: float
+    status: Status
+    gap: GapSection | None = None
+    latency: float = math.nan
+
+
+class LiveFit:
+    """A joint that is ready to be fitted, sweep by sweep.
+
+    Parameters
+    ----------
+    model, joint
+        The joint with its mouth towards the sensor.
+    config : Config
+    """
+
+    def __init__(self, model: Model, joint: Joint, config: Config) -> None:
+        self.model, self.joint, self.config = model, joint, config
+        self._targets = TargetCache(config)
+        self._mouth = mouth_paths(joint)[0]
+        count = math.ceil(self._mouth.length / _STEP)
+        s = np.linspace(0.0, self._mouth.length, max(count, 2) + 1)
+        self._grid = StationGrid.of([self._mouth.rough_frame(float(x)) for x in s], s)
+
+    def prepare(self, height: float) -> None:
+        """Build tables and load kernels with a sweep as designed, seen from ``height``, m; takes seconds."""
+        scenario = Scenario(motion="none", sensor_height=height)
+        for share in (0.5, 0.25, 0.75):
+            section = self.section(share * self.joint.length)
+            if section is not None:
+                truth = random_truth((section,), scenario, 0)
+                self.fit(0, section, simulate_scan((section,), truth, scenario, 0))
+
+    def section(self, s: float) -> JointSection | None:
+        """The design at a place along the joint, m; None where no cross-section shows both components."""
+        return next(iter(design_sections(self.model, self.joint, [s])), None)
+
+    def place(self, sweep: LineScan) -> float:
+        """Where along the joint a sweep in model coordinates crosses it, m; NaN where it does not."""
+        found = sweep_positions(sweep, self._grid, self._mouth, NEAR)
+        if not len(found):
+            return math.nan
+        return float(np.interp(found[0], self._mouth.stops, self.joint.path.stops))
+
+    def fit_placed(self, index: int, sweep: LineScan) -> LiveStation:
+        """Fit a sweep in model coordinates, which says itself where it is."""
+        s = self.place(sweep)
+        if math.isnan(s):
+            return LiveStation(index, s, Status("no_data", "the sweep does not cross the joint"))
+        section = self.section(s)
+        if section is None:
+            return LiveStation(index, s, Status("no_data", "the design shows no gap there"))
+        return self.fit(index, section, sweep)
+
+    def fit(self, index: int, section: JointSection, sweep: LineScan) -> LiveStation:
+        """Fit a sweep in model coordinates to the section that it shows."""
+        (cut,) = cut_slices(
+            sweep,
+            [section.frame],
+            [section.s],
+            thickness=self.config.slices.thickness,
+            reach=match_reach(self.config),
+        )
+        slice_ = with_assumed_view(cut, section)
+        targets = dataclasses.replace(self._targets.get(section, slice_), stations=SWEEPS)
+        estimate = fit_station(section, slice_, targets, self.config).estimate
+        assert estimate is not None  # the method that is asked for makes one, always
+        a, b = estimate.components
+        gap = None
+        if estimate.status.measured and a.pose is not None and b.pose is not None:
+            gap = gap_section(
+                section.s, section.frame, section.gap, a.pose, b.pose, a.covariance, b.covariance
+            )
+        return LiveStation(index, section.s, estimate.status, gap)
+
+
+@dataclass(frozen=True)
+class Mount:
+    """How the sensor is carried.
+
+    Attributes
+    ----------
+    speed : float or None
+        Along the joint, m/s.
+    start : float
+        Where along the joint the first sweep is, m.
+    height : float
+        Of the sensor over the designed mouth, m.
+    pose : ndarray, shape (4, 4), or None
+        T_world_sensor at the first sweep, where it is known; the sensor then goes along its z axis, and
+        ``start`` and ``height`` do not matter.
+    flip : bool
+        Look into the joint's other mouth.
+    """
+
+    speed: float | None = None
+    start: float = 0.0
+    height: float = 0.25
+    pose: Array | None = None
+    flip: bool = False
+
+    def __post_init__(self) -> None:
+        if self.speed is not None and not math.isfinite(self.speed):
+            raise ConfigError(f"--speed must be a number, got {self.speed}")
+        if not self.height > 0.0:
+            raise ConfigError(f"--height must be more than 0, got {self.height:g} m")
+
+
+class Live:
+    """A model's joint, and the sweeps of a sensor or of a recording fitted to it as they come.
+
+    Parameters
+    ----------
+    model_path : Path
+    joint : str, optional
+        Id or ``GUID,GUID``; the longest open joint by default.
+    mount : Mount
+    config : Config
+
+    Raises
+    ------
+    BimfitError
+        When the model or the joint cannot be used.
+    """
+
+    def __init__(self, model_path: Path, joint: str | None, mount: Mount, config: Config) -> None:
+        self.model, found = model_joints(model_path, config.joints, [joint] if joint else [])
+        self._chosen = found[0] if joint else longest_open(found)
+        self._mount, self._config = mount, config
+        self.counters = Counters()
+
+    @property
+    def joint(self) -> Joint:
+        """As designed."""
+        return self._chosen
+
+    def replay(self, path: Path) -> Iterator[LiveStation]:
+        """Fit the sweeps of a recorded line scan, in the order of their numbers.
+
+        A recording in the sensor's own coordinates is placed as the mount says, which needs its ``time``
+        column; any other is taken to be in model coordinates, as it is.
+
+        Raises
+        ------
+        ScanError
+            When the file cannot be read, has no sweeps, or does not show the joint.
+        """
+        scan = load_scan(path)
+        if not isinstance(scan, LineScan):
+            raise ScanError("a point cloud has no sweeps to replay", file=path, remedy="give a line scan")
+        if not len(scan):
+            raise ScanError("there is no sweep to replay", file=path)
+        if "time" in scan.extra and not scan.origins.any():
+            yield from self._replay_carried(scan)
+            return
+        eye = viewpoint_of(scan, self._chosen)
+        if eye is None or not max(covers(scan, path, NEAR) for path in mouth_paths(self._chosen)):
+            raise ScanError(f"the scan does not show joint {self._chosen.id}", file=path)
+        ready = LiveFit(self.model, self._chosen.facing(eye), self._config)
+        ready.prepare(self._mount.height)
+        for number, sweep in _sweeps(scan):
+            yield ready.fit_placed(number, sweep)
+
+    def _replay_carried(self, scan: LineScan) -> Iterator[LiveStation]:
+        place = self._ready(ask="a recording in the sensor's coordinates")
+        for number, sweep in _sweeps(scan):
+            station = place(number, sweep, np.asarray(sweep.extra["time"], float))
+            if station is None:
+                return
+            yield station
+
+    def stream(
+        self, port: str | None, *, field: float, sweeps: int | None = None, told: Callable[[], None]
+    ) -> Iterator[LiveStation]:
+        """Fit a sensor's sweeps as they come, until the joint's end; the laser is off afterwards.
+
+        Parameters
+        ----------
+        port : str, optional
+            None takes the one Hokuyo that is plugged in.
+        field : float
+            Half opening about straight ahead that is measured, rad.
+        sweeps : int, optional
+            End after so many.
+        told : callable
+            Called when everything is ready and the sensor starts.
+
+        Raises
+        ------
+        SensorError
+            When the device cannot be reached, or is gone for good.
+        """
+        place = self._ready(ask="a sensor")
+        clock = host_clock()
+        device = Hokuyo(port, clock=clock)
+        try:
+            with device:
+                steps = device.parameters.steps(-field, field)
+                told()
+                with closing(device.scans(*steps, count=sweeps)) as stream:  # type: ignore[type-var]
+                    for sweep in stream:
+                        station = place(sweep.index, line_scan([sweep]), sweep.times)
+                        if station is None:
+                            return
+                        arrived = sweep.stamp_host + SCAN_DELAY
+                        yield dataclasses.replace(station, latency=clock() - arrived)
+        finally:
+            self.counters = device.counters
+
+    def _ready(self, ask: str) -> Callable[[int, LineScan, Array], LiveStation | None]:
+        """Prepare; what it returns places a sweep in the sensor's coordinates and fits it, or ends."""
+        mount = self._mount
+        if mount.speed is None:
+            raise ConfigError(
+                f"{ask} does not say how fast it moves", remedy="--speed 0.05 (m/s), 0 where it stands"
+            )
+        speed = mount.speed
+        ready = LiveFit(self.model, self._facing(), self._config)
+        ready.prepare(mount.height)
+        first: list[float] = []
+        length = ready.joint.path.length
+
+        def carried_on(index: int, sweep: LineScan, times: Array) -> LiveStation | None:
+            first[len(first) :] = [float(times[0])] if not first else []
+            way = speed * (times - first[0])
+            if mount.pose is not None:
+                return ready.fit_placed(index, carried(sweep, advanced(mount.pose, way)))
+            # each beam has its own time; the section is where the sensor was half way
+            middle = float(0.5 * (way[0] + way[-1]))
+            s = mount.start + middle
+            if (s > length and speed > 0.0) or (s < 0.0 and speed < 0.0):
+                return None
+            section = ready.section(s) if 0.0 <= s <= length else None
+            if section is None:
+                reason = "the design shows no gap there" if 0.0 <= s <= length else "outside the joint"
+                return LiveStation(index, s, Status("no_data", reason))
+            return ready.fit(
+                index, section, carried(sweep, advanced(held_over(section, mount.height), way - middle))
+            )
+
+        return carried_on
+
+    def _facing(self) -> Joint:
+        """The joint with its mouth towards the sensor: where its pose says, else the side easier to reach."""
+        mount, joint = self._mount, self._chosen
+        if mount.pose is not None:
+            return joint.facing(mount.pose[:3, 3])
+        section = designed(self.model, joint, Scenario(sensor_height=mount.height))[0]
+        if float(section.frame.v @ joint.path.rough_frame(section.s).v) < 0.0:
+            joint = dataclasses.replace(joint, path=joint.path.flipped(), legs=joint.legs[::-1])
+        if mount.flip:
+            joint = dataclasses.replace(joint, path=joint.path.flipped(), legs=joint.legs[::-1])
+        return joint
+
+
+def _sweeps(scan: LineScan) -> Iterator[tuple[int, LineScan]]:
+    """Every sweep as a scan of its own."""
+    order = np.argsort(scan.scan, kind="stable")
+    for number, rows in zip(
+        scan.sweeps.tolist(), np.split(order, np.flatnonzero(np.diff(scan.scan[order])) + 1), strict=True
+    ):
+        yield (
+            number,
+            LineScan(
+                scan.scan[rows],
+                scan.origins[rows],
+                scan.directions[rows],
+                scan.ranges[rows],
+                scan.source,
+                extra={name: column[rows] for name, column in scan.extra.items()},
+            ),
+        )
