@@ -27,6 +27,7 @@ from bimfit.estimation.ownership import (
     through,
 )
 from bimfit.estimation.posterior import Posterior, Window, component_posterior
+from bimfit.estimation.residuals import excused, residuals_of
 from bimfit.estimation.result import ComponentEstimate, Residuals, StationEstimate
 from bimfit.estimation.slide import SlideResult, best_start, designed_width
 from bimfit.geometry.joint_section import JointSection
@@ -318,6 +319,6 @@ def _residuals(
     rho, face = scene.rho[which], scene.face[which]
     rows = edge_rows(context.section.components[which], posterior.pose)
     sd, cosine = range_sd(rows, beams, rho, face, posterior.pivot, posterior.pivot_covariance)
-    silent = checks.excused(beams.r, rho, sd, cosine, sigma)
+    silent = excused(beams.r, rho, sd, cosine, sigma)
     blocked = scene.rho[1 - which] < rho
-    return checks.residuals_of(beams, rho, face, (side == which) & usable & ~blocked, sigma, silent)
+    return residuals_of(beams, rho, face, (side == which) & usable & ~blocked, sigma, silent)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bimfit.config import FitConfig, SensorConfig
-from bimfit.estimation.checks import excused, longest_run
+from bimfit.estimation.residuals import excused, longest_run
 from bimfit.estimation.station import estimate_station
 from bimfit.geometry.pose import Pose2D
 from bimfit.geometry.profile import Profile
