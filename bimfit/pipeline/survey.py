@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from bimfit.geometry.pose import Array
 from bimfit.geometry.slice import Slice
 from bimfit.pipeline.fit import check_choice, fit_joint
 from bimfit.pipeline.records import JointResult, SurveyResult
+from bimfit.pipeline.shown import share_shown
 from bimfit.pipeline.targets import match_reach, with_assumed_view
 from bimfit.scan.cloud import PointCloud
 from bimfit.scan.coverage import covers, scan_stations
@@ -30,9 +31,12 @@ if TYPE_CHECKING:
     from bimfit.bim.model import Model
 
 Scan = LineScan | PointCloud
+Cut: TypeAlias = "tuple[Joint, tuple[JointSection, ...], tuple[Slice, ...]]"
 LEAST_COVER = 0.3
 """A joint that was not asked for by name is fitted where the scan shows at least this share of it."""
 NEAR = 0.3
+LEAST_SHOWN = 0.7
+"""... and where both of its components show themselves at this share of the stations."""
 Progress = Callable[[str, float], None]
 
 
@@ -112,9 +116,11 @@ def survey(
             remedy="check its units and its frame; --scan-pose places a scan that is in scanner coordinates",
         )
     results: list[JointResult] = []
-    for k, joint in enumerate(chosen):
-        step = f"joint {joint.id} ({k + 1} of {len(chosen)})"
-        facing, sections, slices = cut_joint(model, joint, scan, config)
+    progress("cutting the joints", 0.0)
+    cuts = [cut_joint(model, joint, scan, config) for joint in chosen]
+    cuts, partly = (cuts, "") if joints else fully_shown(cuts, config)
+    for k, (facing, sections, slices) in enumerate(cuts):
+        step = f"joint {facing.id} ({k + 1} of {len(cuts)})"
         results.append(
             fit_joint(
                 facing,
@@ -126,7 +132,7 @@ def survey(
                 progress=partial(progress, step),
             )
         )
-    notes = (*model.notes, *scan.notes)
+    notes = (*model.notes, *scan.notes, *([partly] if partly else []))
     return SurveyResult(model_path, scan_path, model, scan, config, tuple(results), notes)
 
 
@@ -148,6 +154,23 @@ def covered_joints(joints: Sequence[Joint], scan: Scan, *, asked: bool) -> list[
     """Joints that the scan shows: any of their length where they were asked for, else a good part of it."""
     least = 0.0 if asked else LEAST_COVER
     return [joint for joint in joints if max(covers(scan, path, NEAR) for path in mouth_paths(joint)) > least]
+
+
+def fully_shown(cuts: Sequence[Cut], config: Config) -> tuple[list[Cut], str]:
+    """Leave out joints of which the scan shows one component only, or what stands beside them, and say so.
+
+    Where that would leave none, all are kept: their fits then say what is wrong.
+    """
+    kept = [c for c in cuts if share_shown(c[1], c[2], config).min() >= LEAST_SHOWN]
+    if not kept or len(kept) == len(cuts):
+        return list(cuts), ""
+    ids = {c[0].id for c in kept}
+    left = sorted(c[0].id for c in cuts if c[0].id not in ids)
+    named = ", ".join(left[:6]) + (", ..." if len(left) > 6 else "")
+    return kept, (
+        f"left out {len(left)} joint{'s' if len(left) > 1 else ''} that the scan shows only in part "
+        f"({named}); --joint ID fits one all the same"
+    )
 
 
 def mouth_paths(joint: Joint) -> tuple[JointPath, JointPath]:
