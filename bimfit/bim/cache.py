@@ -6,14 +6,31 @@ import contextlib
 import json
 import os
 import zipfile
+import zlib
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from bimfit.errors import ExportError
 from bimfit.files import whole_file
 from bimfit.geometry.mesh import TriangleMesh
+
+OFF = "BIMFIT_NO_CACHE"
+"""Set to anything but nothing or 0, this environment variable keeps the cache out of use."""
+DAMAGE = (
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    IndexError,
+    EOFError,
+    zipfile.BadZipFile,
+    zipfile.LargeZipFile,
+    zlib.error,
+)
+"""What reading a damaged file of the cache may raise."""
 
 _VERSION = 1
 _MOST_BYTES = 2 << 30
@@ -25,6 +42,11 @@ def cache_folder() -> Path:
 
     named = os.environ.get("BIMFIT_CACHE")
     return Path(named) if named else Path(platformdirs.user_cache_dir("bimfit")) / "models"
+
+
+def cache_wanted() -> bool:
+    """Whether models and joints may be kept between runs at all."""
+    return os.environ.get(OFF, "") in ("", "0")
 
 
 def cache_path(digest: str) -> Path:
@@ -50,16 +72,7 @@ def load_cached(digest: str) -> tuple[dict[str, Any], dict[int, TriangleMesh]] |
         with contextlib.suppress(OSError):
             os.utime(path)
         return about, meshes
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        IndexError,
-        EOFError,
-        zipfile.BadZipFile,
-        zipfile.LargeZipFile,
-    ):
+    except DAMAGE:
         return None
 
 
@@ -69,24 +82,29 @@ def store_cached(digest: str, about: dict[str, Any], meshes: dict[int, TriangleM
     splits = np.concatenate([np.zeros((1, 2), np.int64), np.cumsum(np.reshape(sizes, (-1, 2)), axis=0)])
     text = json.dumps({**about, "digest": digest}).encode()
     blank_v, blank_f = np.zeros((0, 3)), np.zeros((0, 3), np.int32)
+    arrays = {
+        "about": np.frombuffer(text, np.uint8),
+        "ids": np.array(list(meshes), np.int64),
+        "splits": splits.astype(np.int64),
+        "vertices": np.concatenate([blank_v, *(m.vertices for m in meshes.values())]),
+        "faces": np.concatenate([blank_f, *(m.faces.astype(np.int32) for m in meshes.values())]),
+    }
+    return keep_file(cache_path(digest), lambda stream: np.savez(stream, **arrays))  # type: ignore[arg-type]
+
+
+def keep_file(path: Path, write: Callable[[BinaryIO], None]) -> bool:
+    """Write a file of the cache, whole; False where that is impossible, which is no error."""
     try:
-        with whole_file(cache_path(digest)) as part, part.open("wb") as stream:
-            np.savez(
-                stream,
-                about=np.frombuffer(text, np.uint8),
-                ids=np.array(list(meshes), np.int64),
-                splits=splits.astype(np.int64),
-                vertices=np.concatenate([blank_v, *(m.vertices for m in meshes.values())]),
-                faces=np.concatenate([blank_f, *(m.faces.astype(np.int32) for m in meshes.values())]),
-            )
-        _prune(cache_folder())
+        with whole_file(path) as part, part.open("wb") as stream:
+            write(stream)
+        _prune(path.parent)
     except (ExportError, OSError):
         return False
     return True
 
 
 def _prune(folder: Path) -> None:
-    """Drop the models that were used longest ago, down to the folder's limit."""
+    """Drop what was used longest ago, down to the folder's limit."""
     files = sorted(((p.stat().st_mtime, p.stat().st_size, p) for p in folder.glob("*.npz")), reverse=True)
     used = 0
     for _, size, path in files:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from bimfit.bim.drafts import Draft, Limits, find_drafts
 from bimfit.bim.joint import Joint
+from bimfit.bim.joint_store import load_joints, store_joints, store_key
 from bimfit.bim.model import Element, Model
 from bimfit.config import JointConfig
 from bimfit.errors import JointError
@@ -57,7 +58,7 @@ def find_joints(model: Model, config: JointConfig | None = None) -> tuple[Joint,
     config = config or JointConfig()
     eligible = np.array([_eligible(element, config) for element in model.elements], bool)
     limits = Limits(max_gap=config.max_gap, min_length=config.min_length)
-    joints = _joints(model.elements, eligible, limits)
+    joints = _kept_joints(model, eligible, limits)
     return tuple(joint for joint in joints if _listed(joint, config))
 
 
@@ -219,6 +220,18 @@ def _listed(joint: Joint, config: JointConfig) -> bool:
     if config.min_gap is not None and joint.width < config.min_gap:
         return False
     return config.everything or (joint.accessible and joint.kind not in _HIDDEN)
+
+
+def _kept_joints(model: Model, eligible: NDArray[np.bool_], limits: Limits) -> tuple[Joint, ...]:
+    """The model's joints, out of the cache where the same search was made before."""
+    if not model.cached:
+        return _joints(model.elements, eligible, limits)
+    key = store_key(model.elements, eligible, limits)
+    joints = load_joints(key, model.elements)
+    if joints is None:
+        joints = _joints(model.elements, eligible, limits)
+        store_joints(key, joints, model.elements)
+    return joints
 
 
 def _joints(elements: Sequence[Element], eligible: NDArray[np.bool_], limits: Limits) -> tuple[Joint, ...]:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from bimfit.bim.cache import load_cached, store_cached
+from bimfit.bim.cache import cache_wanted, load_cached, store_cached
 from bimfit.bim.georeference import GeoReference
 from bimfit.bim.loading import tessellate
 from bimfit.bim.source import Source, read_source
@@ -74,6 +74,8 @@ class Model:
     georeference : GeoReference or None
     notes : tuple of str
         What a user should know about how the file was read.
+    cached : bool
+        Whether what is worked out from it may be kept in the user's cache folder.
     """
 
     path: Path
@@ -82,6 +84,7 @@ class Model:
     skipped: tuple[Skipped, ...] = ()
     georeference: GeoReference | None = None
     notes: tuple[str, ...] = ()
+    cached: bool = False
     _by_guid: dict[str, Element] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -109,6 +112,16 @@ class Model:
         near = difflib.get_close_matches(guid, self._by_guid, n=3, cutoff=0.6)
         remedy = f"the nearest are {', '.join(near)}" if near else "bimfit joints lists those that meet"
         raise JointError(f"no element has the GlobalId {guid}", file=self.path, remedy=remedy)
+
+    def left_out(self, most: int = 20) -> tuple[str, ...]:
+        """A line for each element that was skipped, and why; beyond ``most``, how many more there are."""
+        lines = [
+            f"left out: {' '.join(part for part in (skip.guid, skip.name) if part)} "
+            f"({skip.ifc_class}): it {skip.reason}"
+            for skip in self.skipped[:most]
+        ]
+        more = len(self.skipped) - most
+        return (*lines, f"left out: {more} more elements") if more > 0 else tuple(lines)
 
     @cached_property
     def bounds(self) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -157,7 +170,7 @@ def load_model(
     time_limit : float
         Seconds that one element's geometry may take before it is skipped.
     cache : bool
-        Whether meshes are kept in the user's cache folder, by the file's content.
+        Whether meshes, and joints found between them, are kept in the user's cache folder, by content.
 
     Raises
     ------
@@ -165,6 +178,7 @@ def load_model(
         When the file cannot be read or holds no element with geometry.
     """
     source = read_source(path)
+    cache = cache and cache_wanted()
     kept = load_cached(source.digest) if cache and include is None else None
     if kept is None:
         raw = tessellate(source, include, time_limit)
@@ -174,14 +188,16 @@ def load_model(
         # what failed may have failed for want of time or memory: then try again next time
         if cache and include is None and raw.meshes and not raw.notes and not _by_chance(failed):
             store_cached(source.digest, about, raw.meshes)
-    return _assemble(source, *kept)
+    return _assemble(source, *kept, cached=cache and include is None)
 
 
 def _by_chance(failed: dict[str, str]) -> bool:
     return any("took more than" in reason for reason in failed.values())
 
 
-def _assemble(source: Source, about: dict[str, Any], meshes: dict[int, TriangleMesh]) -> Model:
+def _assemble(
+    source: Source, about: dict[str, Any], meshes: dict[int, TriangleMesh], *, cached: bool
+) -> Model:
     index = about["index"]
     notes = [*source.notes, *index.get("notes", ()), *about["notes"]]
     elements: dict[str, Element] = {}
@@ -208,6 +224,7 @@ def _assemble(source: Source, about: dict[str, Any], meshes: dict[int, TriangleM
         tuple(sorted(skipped, key=lambda skip: skip.guid)),
         GeoReference(**place) if place else None,
         tuple(notes),
+        cached,
     )
 
 

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
 from bimfit.cli.options import joint_config
+
+if TYPE_CHECKING:
+    from bimfit.bim.joint import Joint
+    from bimfit.bim.model import Model
 
 
 def run(
@@ -16,17 +22,46 @@ def run(
     max_gap: str | None = typer.Option(None, "--max-gap", help="Widest gap, such as 60mm."),
     min_length: str | None = typer.Option(None, "--min-length", help="Shortest joint, such as 100mm."),
 ) -> int:
-    """List the joints of a model."""
-    from bimfit.pipeline.survey import model_joints
+    """List the joints of a model; what was left out of it is named on standard error."""
+    from bimfit.pipeline.listing import model_joints
 
     building, joints = model_joints(model, joint_config(max_gap, min_length))
     if as_json:
         print(json.dumps([joint.to_dict() for joint in joints], indent=1, ensure_ascii=False))
-        return 0
-    names = {element.guid: element.name for element in building.elements}
-    print(f"{'id':14} {'kind':12} {'width mm':>8} {'length mm':>9}  elements")
-    for joint in joints:
-        pair = "  ".join(f"{guid} {names.get(guid, '')}".rstrip() for guid in joint.elements)
-        print(f"{joint.id:14} {joint.kind:12} {joint.width * 1e3:8.1f} {joint.length * 1e3:9.0f}  {pair}")
-    print(f"{len(joints)} joints in {len(building.elements)} elements")
+    else:
+        print("\n".join(_table(building, joints)))
+    _tell_notes(building)
     return 0
+
+
+def _table(model: Model, joints: tuple[Joint, ...]) -> list[str]:
+    names = {element.guid: element.name for element in model.elements}
+
+    def named(guid: str) -> str:
+        return f"{guid} {names.get(guid, '')}".rstrip()
+
+    lines = [f"{'id':8} {'kind':12} {'state':6} {'mouth':5} {'width mm':>8} {'length mm':>9}  elements"]
+    for joint in joints:
+        filler = f"; filled with {named(joint.filler)}" if joint.filler else ""
+        mouth = "both" if joint.two_sided else "one" if joint.accessible else "none"
+        lines.append(
+            f"{joint.id:8} {joint.kind:12} {joint.state:6} {mouth:5} {joint.width * 1e3:8.1f} "
+            f"{joint.length * 1e3:9.0f}  {'  '.join(map(named, joint.elements))}{filler}"
+        )
+    counts = {state: sum(joint.state == state for joint in joints) for state in joint_states(joints)}
+    told = ", ".join(f"{count} {_STATES[state]}" for state, count in counts.items())
+    return [*lines, f"{len(joints)} joints in {len(model.elements)} elements: {told}"]
+
+
+_STATES = {"open": "open", "filled": "filled", "touch": "touching", "clash": "overlapping (clash)"}
+
+
+def joint_states(joints: tuple[Joint, ...]) -> list[str]:
+    """The states that occur, in the order of the list."""
+    return [state for state in _STATES if any(joint.state == state for joint in joints)]
+
+
+def _tell_notes(model: Model) -> None:
+    """Say on standard error how the file was read, and what was left out of it."""
+    for note in (*model.notes, *model.left_out()):
+        print(f"bimfit: note: {note}", file=sys.stderr)

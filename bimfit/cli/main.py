@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import typer
 
@@ -13,6 +14,7 @@ from bimfit import __version__
 from bimfit.cli import bench, capture, compare, demo, emulate, fit, joints, live, simulate, view
 from bimfit.errors import BimfitError
 
+CACHE_OFF = "BIMFIT_NO_CACHE"
 DONE, PARTLY, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 app = typer.Typer(
@@ -48,8 +50,11 @@ def _root(
         False, "--version", help="Print the version.", callback=_show_version, is_eager=True
     ),
     debug: bool = typer.Option(False, "--debug", help="Show the traceback of an error."),
+    no_cache: bool = typer.Option(
+        False, "--no-cache", help="Read models and find joints anew; keep nothing for the next run."
+    ),
 ) -> None:
-    """Options that every command takes; ``--debug`` is read in :func:`main` wherever it stands."""
+    """Options that every command takes; the last two are read in :func:`main` wherever they stand."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -62,9 +67,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words
-    words = [word for word in words if word != "--debug"]
+    no_cache = "--no-cache" in words
+    words = [word for word in words if word not in ("--debug", "--no-cache")]
     try:
-        status = app(words, prog_name="bimfit", standalone_mode=False)
+        with _without_cache() if no_cache else contextlib.nullcontext():
+            status = app(words, prog_name="bimfit", standalone_mode=False)
     except BimfitError as error:
         return _refuse(str(error), debug)
     except KeyboardInterrupt:
@@ -78,6 +85,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         line = f"internal error ({type(error).__name__}: {error}); please report it with what --debug shows"
         return _refuse(line, debug)
     return status if isinstance(status, int) else DONE
+
+
+@contextlib.contextmanager
+def _without_cache() -> Iterator[None]:
+    """Keep the user's cache out of use, in child processes too."""
+    before = os.environ.get(CACHE_OFF)
+    os.environ[CACHE_OFF] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[CACHE_OFF]
+        else:
+            os.environ[CACHE_OFF] = before
 
 
 def _refuse(line: str, debug: bool, status: int = BAD_INPUT) -> int:

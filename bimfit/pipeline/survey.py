@@ -11,14 +11,15 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from bimfit.bim.stations import HasElements, HasMesh, design_sections
-from bimfit.config import Config, JointConfig
-from bimfit.errors import JointError, ScanError
+from bimfit.config import Config
+from bimfit.errors import ScanError
 from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.line_scan import LineScan
 from bimfit.geometry.path import JointPath
 from bimfit.geometry.pose import Array
 from bimfit.geometry.slice import Slice
 from bimfit.pipeline.fit import check_choice, fit_joint
+from bimfit.pipeline.listing import model_joints as model_joints
 from bimfit.pipeline.records import JointResult, SurveyResult
 from bimfit.pipeline.shown import share_shown
 from bimfit.pipeline.targets import match_reach, with_assumed_view
@@ -42,32 +43,6 @@ Progress = Callable[[str, float], None]
 
 def silent(_step: str, _share: float) -> None:
     """Report no progress."""
-
-
-def model_joints(
-    path: Path, config: JointConfig, wanted: Sequence[str] = ()
-) -> tuple[Model, tuple[Joint, ...]]:
-    """Load a model and find its joints, or just those that are ``wanted`` by id or ``GUID,GUID``.
-
-    Raises
-    ------
-    ModelError
-        When the model cannot be read or holds no joint.
-    JointError
-        When a joint that is asked for does not exist.
-    """
-    from bimfit.bim.joints import find_joints, no_joint_reason, select_joints
-    from bimfit.bim.model import load_model
-
-    model = load_model(path)
-    joints = select_joints(model, wanted, config) if wanted else find_joints(model, config)
-    if not joints:
-        raise JointError(
-            f"no joint found: {no_joint_reason(model, config)}",
-            file=path,
-            remedy="name the pair with --joint GUID,GUID or widen --max-gap",
-        )
-    return model, joints
 
 
 def survey(
@@ -132,7 +107,8 @@ def survey(
                 progress=partial(progress, step),
             )
         )
-    notes = (*model.notes, *scan.notes, *([partly] if partly else []))
+    said = (*model.notes, *model.left_out(most=3), *scan.notes)
+    notes = (*said, *([partly] if partly else []))
     return SurveyResult(model_path, scan_path, model, scan, config, tuple(results), notes)
 
 

@@ -1,5 +1,6 @@
 """The loader: every state that a file can be in ends in a model or in one clear line."""
 
+import dataclasses
 import random
 import zipfile
 from pathlib import Path
@@ -10,9 +11,14 @@ import pytest
 
 from bimfit.bim import loading
 from bimfit.bim.cache import cache_path
+from bimfit.bim.drafts import Limits
 from bimfit.bim.georeference import GeoReference, map_scale
+from bimfit.bim.joint_store import store_key
+from bimfit.bim.joints import find_joints
 from bimfit.bim.model import element_from_mesh, load_model, model_from_elements
 from bimfit.bim.source import nearest_schema, read_source
+from bimfit.cli.main import main
+from bimfit.config import JointConfig
 from bimfit.errors import JointError, ModelError
 from bimfit.geometry.mesh import TriangleMesh
 
@@ -206,6 +212,79 @@ def test_cache_gives_the_same_and_survives_damage(monkeypatch):
     for damage in (whole[: len(whole) // 2], b"", whole[:200] + b"\xff" * 60 + whole[260:]):
         path.write_bytes(damage)
         assert len(load_model(BUTT).elements) == 2
+
+
+def plain(joints):
+    return [
+        (joint.to_dict(), joint.legs, joint.path.points.tolist(), joint.path.v.tolist()) for joint in joints
+    ]
+
+
+def test_joints_come_out_of_the_cache_as_they_went_in(monkeypatch):
+    model = load_model(SAMPLES / "facade.ifc")
+    first = find_joints(model)
+    assert len(first) == 17
+
+    def forbidden(*_):
+        raise AssertionError("searched again")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("bimfit.bim.joints._joints", forbidden)
+        assert plain(find_joints(load_model(SAMPLES / "facade.ifc"))) == plain(first)
+        # other settings, another finder and models that are not to be kept are searched
+        for config in (
+            JointConfig(max_gap=0.03),
+            JointConfig(min_length=2.99),
+            JointConfig(classes=("IfcWall",)),
+        ):
+            if config.classes:  # all of them are walls: the same search
+                assert plain(find_joints(model, config)) == plain(first)
+                continue
+            with pytest.raises(AssertionError, match="searched again"):
+                find_joints(model, config)
+        with pytest.raises(AssertionError, match="searched again"):
+            find_joints(load_model(SAMPLES / "facade.ifc", cache=False))
+        patch.setattr("bimfit.bim.joint_store._finder_version", lambda: "another")
+        with pytest.raises(AssertionError, match="searched again"):
+            find_joints(model)
+
+
+def test_a_moved_vertex_is_another_search_and_damage_is_repaired():
+    model = load_model(BUTT)
+    limits, all_ = Limits(), np.ones(2, bool)
+    key = store_key(model.elements, all_, limits)
+    first, second = model.elements
+    moved = dataclasses.replace(first, mesh=TriangleMesh.of(first.mesh.vertices + 1e-9, first.mesh.faces))
+    assert store_key([moved, second], all_, limits) != key
+    assert store_key(model.elements, np.array([True, False]), limits) != key
+    assert store_key(model.elements, all_, Limits(max_gap=0.05)) != key
+    before = plain(find_joints(model))
+    (file,) = cache_path("").parent.glob("*.joints.npz")
+    whole = file.read_bytes()
+    for damage in (whole[: len(whole) // 2], b"", whole[:300] + b"\xff" * 60 + whole[360:]):
+        file.write_bytes(damage)
+        assert plain(find_joints(model)) == before
+
+
+def test_no_cache_leaves_no_trace(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("BIMFIT_CACHE", str(tmp_path / "unused"))
+    assert main(["joints", str(BUTT), "--no-cache"]) == 0
+    assert not (tmp_path / "unused").exists()
+    assert main(["joints", str(BUTT)]) == 0
+    assert len(list((tmp_path / "unused").iterdir())) == 2
+    assert "1 joints in 2 elements" in capsys.readouterr().out
+
+
+def test_what_was_left_out_is_said_to_the_user(tmp_path, capsys):
+    file = ifcopenshell.open(SAMPLES / "facade.ifc")
+    panel = file.by_type("IfcWall")[0]
+    panel.Representation.Representations[0].Items[0].Depth = 1e300
+    file.write(str(tmp_path / "bad.ifc"))
+    path = altered(tmp_path, b"'IFC4'", b"'IFC4X1'", source=tmp_path / "bad.ifc")
+    assert main(["joints", str(path), "--json"]) == 0
+    said = capsys.readouterr().err
+    assert "schema IFC4X1 was read as IFC4X3_ADD2" in said
+    assert f"left out: {panel.GlobalId} {panel.Name} (IfcWall): it " in said
 
 
 def test_a_cache_that_cannot_be_written_is_no_error(tmp_path, monkeypatch):
