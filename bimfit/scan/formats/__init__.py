@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 
 from bimfit.errors import ExportError, ScanError
 from bimfit.files import whole_file
@@ -15,9 +14,12 @@ from bimfit.scan.cloud import PointCloud
 from bimfit.scan.formats.delimited import read_csv, write_csv
 from bimfit.scan.formats.las import read_las
 from bimfit.scan.formats.npz import read_npz, write_npz
+from bimfit.scan.formats.options import ANY, ReadOptions
+from bimfit.scan.formats.packing import GZIP, unpacked
 from bimfit.scan.formats.pcd import read_pcd, write_pcd
 from bimfit.scan.formats.ply import read_ply, write_ply
 from bimfit.scan.formats.ptx import read_ptx
+from bimfit.scan.formats.summary import summary
 from bimfit.scan.formats.text import first_lines
 from bimfit.scan.formats.xyz import looks_like_points, read_xyz, write_xyz
 
@@ -34,44 +36,61 @@ class Format:
     extensions : tuple of str
         Lower case, with the dot.
     read : callable
-        Path -> scan, in the file's own unit.
+        (path, options) -> scan, in the file's own unit.
     write : callable or None
         (scan, path) -> None; None where the format is only read.
     magic : tuple of bytes
         What such files start with; empty where that says nothing.
+    looks : callable or None
+        Tells from a file's first bytes whether it is one, where there is no magic but a look that others
+        do not have.
     beams : bool
         Whether a line scan can be written without losing its beams.
+    unit : float
+        Metres a unit of length where nothing else is said.
+    sized : bool
+        Whether the reader itself turns all lengths into metres (pictures, whose pixels have sizes).
     """
 
     name: str
     extensions: tuple[str, ...]
-    read: Callable[[Path], Scan]
+    read: Callable[[Path, ReadOptions], Scan]
     write: Callable[[Scan, Path], None] | None = None
     magic: tuple[bytes, ...] = ()
+    looks: Callable[[bytes], bool] | None = None
     beams: bool = False
+    unit: float = 1.0
+    sized: bool = False
+
+
+def _plain(read: Callable[[Path], Scan]) -> Callable[[Path, ReadOptions], Scan]:
+    """A reader that no option concerns."""
+    return lambda path, options: read(path)
 
 
 FORMATS: tuple[Format, ...] = (
-    Format("CSV", (".csv",), read_csv, write_csv, beams=True),
-    Format("NPZ", (".npz",), read_npz, write_npz, (b"PK\x03\x04",), beams=True),
-    Format("PLY", (".ply",), read_ply, write_ply, (b"ply\n", b"ply\r\n")),
-    Format("PCD", (".pcd",), read_pcd, write_pcd, (b"# .PCD", b"VERSION 0.7", b"VERSION .7")),
-    Format("LAS", (".las", ".laz"), read_las, None, (b"LASF",)),
-    Format("PTX", (".ptx",), read_ptx),
-    Format("XYZ", (".xyz", ".txt", ".pts", ".asc"), read_xyz, write_xyz),
+    Format("CSV", (".csv",), _plain(read_csv), write_csv, beams=True),
+    Format("NPZ", (".npz",), _plain(read_npz), write_npz, (b"PK\x03\x04",), beams=True),
+    Format("PLY", (".ply",), _plain(read_ply), write_ply, (b"ply\n", b"ply\r\n")),
+    Format("PCD", (".pcd",), _plain(read_pcd), write_pcd, (b"# .PCD", b"VERSION 0.7", b"VERSION .7")),
+    Format("LAS", (".las", ".laz"), _plain(read_las), None, (b"LASF",)),
+    Format("PTX", (".ptx",), _plain(read_ptx)),
+    Format("XYZ", (".xyz", ".txt", ".pts", ".asc"), _plain(read_xyz), write_xyz),
 )
 
 
-def read_scan(path: str | Path, unit: float = 1.0) -> Scan:
-    """Read a line scan or a point cloud, whichever the file holds.
+def read_scan(path: str | Path, unit: float | None = None, options: ReadOptions = ANY) -> Scan:
+    """Read a line scan or a point cloud, whichever the file holds; its last note says what was read.
 
     Parameters
     ----------
     path : str or Path
         The content names the format where it can (PLY, PCD, NPZ), else the extension, else whether it looks
-        like rows of numbers.
-    unit : float
-        Metres a unit of length of the file.
+        like rows of numbers. A file packed by gzip is unpacked on the way.
+    unit : float, optional
+        Metres a unit of length of the file; goes before that of ``options``.
+    options : ReadOptions
+        What else the file may not say.
 
     Raises
     ------
@@ -79,13 +98,28 @@ def read_scan(path: str | Path, unit: float = 1.0) -> Scan:
         In one clear line, when the file cannot be read or holds no scan.
     """
     source = Path(path)
-    if not (np.isfinite(unit) and unit > 0.0):
-        raise ScanError(f"a unit must be a positive number of metres, got {unit}", file=source)
+    if unit is not None:
+        options = replace(options, unit=unit)
     if source.is_dir():
         raise ScanError("is a folder", file=source, remedy="name a scan file")
     head = first_lines(source)
-    scan = _format_of(source, head).read(source)
-    return scan if unit == 1.0 else scaled(scan, unit)
+    if head.startswith(GZIP):
+        with unpacked(source) as inner:
+            return _read(format_of(inner, first_lines(inner)), inner, options, str(source))
+    return _read(format_of(source, head), source, options)
+
+
+def _read(form: Format, path: Path, options: ReadOptions, source: str = "") -> Scan:
+    try:
+        scan = form.read(path, options)
+    except ScanError as error:
+        if not source:
+            raise
+        raise ScanError(error.message, file=source, place=error.place, remedy=error.remedy) from error
+    unit = options.unit or form.unit
+    if unit != 1.0 and not form.sized:
+        scan = scaled(scan, unit)
+    return replace(scan, source=source or scan.source, notes=(*scan.notes, summary(scan, form.name, unit)))
 
 
 def write_scan(scan: Scan, path: str | Path) -> None:
@@ -120,10 +154,19 @@ def scaled(scan: Scan, factor: float) -> Scan:
     return replace(scan, origins=scan.origins * factor, ranges=scan.ranges * factor)
 
 
-def _format_of(path: Path, head: bytes) -> Format:
-    # what a file says of itself beats its name
+def format_of(path: Path, head: bytes) -> Format:
+    """The format of a file with such first bytes; what a file says of itself beats its name.
+
+    Raises
+    ------
+    ScanError
+        When it is none that is known.
+    """
     for form in FORMATS:
         if any(head.startswith(magic) for magic in form.magic):
+            return form
+    for form in FORMATS:
+        if form.looks is not None and form.looks(head):
             return form
     suffix = path.suffix.lower()
     for form in FORMATS:

@@ -1,0 +1,58 @@
+"""What was read, in a line that a user can check."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bimfit.geometry.line_scan import LineScan
+from bimfit.geometry.pose import Array
+from bimfit.scan.cloud import PointCloud
+from bimfit.scan.formats.options import unit_name
+
+_MOST_PLACES = 3
+_SAME_PLACE = 1e-6
+
+
+def summary(scan: LineScan | PointCloud, form: str, unit: float) -> str:
+    """Say what a scan holds.
+
+    Parameters
+    ----------
+    scan : LineScan or PointCloud
+        In metres.
+    form : str
+        The format's name.
+    unit : float
+        Metres a unit of length in the file.
+    """
+    if isinstance(scan, PointCloud):
+        parts = [f"{len(scan):,} points"]
+        parts.append(
+            "sensor position unknown" if scan.viewpoint is None else f"seen from {_at(scan.viewpoint)}"
+        )
+    else:
+        silent = int(np.count_nonzero(~scan.returned))
+        parts = [f"{len(scan):,} beams in {len(scan.sweeps):,} sweeps", f"{silent:,} without return"]
+        parts.append(_places(scan.origins))
+    parts.append(f"stored in {unit_name(unit)}")
+    low, high = scan.bounds
+    if np.isfinite(low).all():
+        parts.append(f"from {_at(low)} to {_at(high)} m")
+    return f"{form}: {', '.join(parts)}"
+
+
+def _places(origins: Array) -> str:
+    """Where the sensor was."""
+    if not len(origins):
+        return "no sensor position"
+    move = np.flatnonzero((np.abs(np.diff(origins, axis=0)) > _SAME_PLACE).any(axis=1)) + 1
+    seen = np.unique(np.round(origins[np.r_[0, move]] / _SAME_PLACE), axis=0)
+    if len(seen) == 1:
+        return f"seen from {_at(origins[0])}"
+    if len(seen) <= _MOST_PLACES:
+        return "seen from " + " and ".join(_at(place * _SAME_PLACE) for place in seen)
+    return f"seen from {len(seen):,} places between {_at(origins.min(axis=0))} and {_at(origins.max(axis=0))}"
+
+
+def _at(point: Array) -> str:
+    return "(" + ", ".join(f"{x:.10g}" for x in np.round(np.asarray(point, float), 4) + 0.0) + ")"
