@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-
 from bimfit.errors import ExportError, ScanError
 from bimfit.files import whole_file
 from bimfit.geometry.line_scan import LineScan
