@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bimfit.bim.ifc_writer import IfcWriter
-from bimfit.bim.source import read_source
-from bimfit.errors import ExportError, JointError, ModelError
+from bimfit.bim.opening import open_ifc
+from bimfit.errors import ExportError, JointError
 from bimfit.files import protect_inputs, whole_file
 from bimfit.geometry.mesh import TriangleMesh
 from bimfit.geometry.pose import Array
@@ -111,7 +110,7 @@ def write_as_built(
     """
     target = Path(output)
     protect_inputs([target], [Path(model)])
-    writer = IfcWriter(_opened(Path(model)), "bimfit as-built")
+    writer = IfcWriter(open_ifc(model), "bimfit as-built")
     for gap in gaps:
         _add_gap(writer, gap, Path(model))
     for guid, motion in sorted((moved or {}).items()):
@@ -122,21 +121,6 @@ def write_as_built(
         except RuntimeError as error:
             raise ExportError(f"cannot be written: {error}", file=target) from error
     return target
-
-
-def _opened(path: Path) -> Any:
-    import ifcopenshell
-
-    source = read_source(path)
-    with tempfile.TemporaryDirectory(prefix="bimfit-") as folder:
-        place = path
-        if not source.as_is:
-            place = Path(folder) / "model.ifc"
-            place.write_bytes(source.data)
-        try:
-            return ifcopenshell.open(str(place))
-        except Exception as error:  # ifcopenshell's errors share no base
-            raise ModelError(f"cannot be parsed: {error}", file=path) from error
 
 
 def _element(writer: IfcWriter, guid: str, path: Path) -> Any:

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
+from bimfit.cli.choosing import choosing
 from bimfit.cli.options import build_config, read_pose
 from bimfit.cli.progress import terminal_progress
 
+if TYPE_CHECKING:
+    from bimfit.bim.selection import Selection
 
+
+@choosing
 def run(
+    choice: Selection,
     model: Path = typer.Argument(..., metavar="MODEL.ifc", help="The building model."),
     scan: Path = typer.Argument(..., metavar="SCAN", help="Line scan or point cloud."),
     output: Path = typer.Option(
@@ -22,7 +29,6 @@ def run(
     truth: Path | None = typer.Option(
         None, "--truth", metavar="FILE", help="Truth to measure errors against."
     ),
-    joint: list[str] = typer.Option([], "--joint", metavar="ID|GUID,GUID", help="A joint; may be repeated."),
     spacing: str | None = typer.Option(None, "--spacing", help="Distance between stations, such as 10mm."),
     scan_pose: str | None = typer.Option(
         None, "--scan-pose", metavar="POSE|FILE", help="Scanner pose in the model."
@@ -43,7 +49,14 @@ def run(
     check_folder(output)
     with terminal_progress() as progress:
         result = compare(
-            model, scan, settings, methods=names, truth=truth, joints=joint, scan_pose=pose, progress=progress
+            model,
+            scan,
+            settings,
+            methods=names,
+            truth=truth,
+            joints=choice,
+            scan_pose=pose,
+            progress=progress,
         )
         write_comparison(result, output)
     print(comparison_table(result))

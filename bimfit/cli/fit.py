@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
+from bimfit.cli.choosing import choosing
 from bimfit.cli.options import build_config, read_pose
 from bimfit.cli.progress import terminal_progress
 
+if TYPE_CHECKING:
+    from bimfit.bim.selection import Selection
 
+
+@choosing
 def run(
+    choice: Selection,
     model: Path = typer.Argument(..., metavar="MODEL.ifc", help="The building model."),
     scan: Path = typer.Argument(
         ..., metavar="SCAN", help="Line scan (csv, npz) or point cloud (ply, pcd, xyz, ...)."
     ),
     output: Path = typer.Option(..., "-o", "--output", metavar="DIR", help="Where the results go."),
-    joint: list[str] = typer.Option(
-        [], "--joint", metavar="ID|GUID,GUID", help="A joint to fit; may be repeated."
-    ),
     method: str = typer.Option(
         "grcsm", "--method", metavar="M", help="The matcher: grcsm, block, mrcsm, icp-point, ..."
     ),
@@ -66,7 +70,7 @@ def run(
             model,
             scan,
             settings,
-            joints=joint,
+            joints=choice,
             method=method,
             motion=motion,
             scan_pose=pose,

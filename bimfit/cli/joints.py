@@ -9,23 +9,28 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from bimfit.cli.choosing import choosing
 from bimfit.cli.options import joint_config
 
 if TYPE_CHECKING:
     from bimfit.bim.joint import Joint
     from bimfit.bim.model import Model
+    from bimfit.bim.selection import Selection
 
 
+@choosing
 def run(
+    choice: Selection,
     model: Path = typer.Argument(..., metavar="MODEL.ifc", help="The building model."),
     as_json: bool = typer.Option(False, "--json", help="Print an array of objects instead of a table."),
-    max_gap: str | None = typer.Option(None, "--max-gap", help="Widest gap, such as 60mm."),
-    min_length: str | None = typer.Option(None, "--min-length", help="Shortest joint, such as 100mm."),
+    max_gap: str | None = typer.Option(
+        None, "--max-gap", help="How far apart the finder looks, such as 60mm; as --width ..60mm."
+    ),
 ) -> int:
     """List the joints of a model; what was left out of it is named on standard error."""
     from bimfit.pipeline.listing import model_joints
 
-    building, joints = model_joints(model, joint_config(max_gap, min_length))
+    building, joints = model_joints(model, joint_config(max_gap), choice)
     if as_json:
         print(json.dumps([joint.to_dict() for joint in joints], indent=1, ensure_ascii=False))
     else:

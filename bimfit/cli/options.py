@@ -113,8 +113,8 @@ def build_config(
     return dataclasses.replace(config, search=search, slices=slices, sensor=sensor)
 
 
-def joint_config(max_gap: str | None, min_length: str | None, base: JointConfig | None = None) -> JointConfig:
-    """Which joints to list, from ``--max-gap`` and ``--min-length``.
+def joint_config(max_gap: str | None, base: JointConfig | None = None) -> JointConfig:
+    """How far apart the finder looks, from ``--max-gap``.
 
     Raises
     ------
@@ -124,8 +124,6 @@ def joint_config(max_gap: str | None, min_length: str | None, base: JointConfig 
     config = base or JointConfig()
     if max_gap:
         config = dataclasses.replace(config, max_gap=length(max_gap, "--max-gap"))
-    if min_length:
-        config = dataclasses.replace(config, min_length=length(min_length, "--min-length"))
     return config
 
 

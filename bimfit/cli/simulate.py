@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
+from bimfit.cli.choosing import choosing
 
+if TYPE_CHECKING:
+    from bimfit.bim.selection import Selection
+
+
+@choosing
 def run(
+    choice: Selection,
     model: Path = typer.Argument(..., metavar="MODEL.ifc", help="The building model."),
     output: Path = typer.Option(
         ..., "-o", "--output", metavar="SCAN", help="Line scan to write (csv or npz)."
@@ -19,14 +28,11 @@ def run(
     truth: Path | None = typer.Option(
         None, "--truth", metavar="FILE", help="Where the truth is written (json)."
     ),
-    joint: list[str] = typer.Option(
-        [],
-        "--joint",
-        metavar="ID|GUID,GUID",
-        help="A joint to scan; may be repeated. Default: the longest open one.",
-    ),
 ) -> int:
-    """Scan a joint whose components have moved at random, with a virtual rangefinder."""
+    """Scan joints whose components have moved at random, with a virtual rangefinder.
+
+    All joints that the options choose are scanned; without any, the longest open one.
+    """
     from bimfit.files import protect_inputs
     from bimfit.pipeline.simulate import simulate
     from bimfit.scan.formats import write_scan
@@ -36,7 +42,7 @@ def run(
     inputs = [path for path in (model, scenario) if path is not None]
     protect_inputs([path for path in (output, truth) if path is not None], inputs)
     settings = load_scenario(scenario) if scenario else Scenario()
-    scan, truths = simulate(model, settings, seed, joints=joint)
+    scan, truths = simulate(model, settings, seed, joints=choice, told=_note)
     write_scan(scan, output)
     if truth is not None:
         write_truth(truths, truth, model=model, scan=output)
@@ -45,3 +51,7 @@ def run(
         print(f"{one.id}: {one.kind} {pair}, designed {one.width * 1e3:.1f} mm, {len(one.stations)} stations")
     print(f"{len(scan)} beams in {len(scan.sweeps)} sweeps: {output}")
     return 0
+
+
+def _note(text: str) -> None:
+    print(f"bimfit: note: {text}", file=sys.stderr)

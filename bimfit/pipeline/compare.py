@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ from bimfit.simulation.truth import JointTruth, read_truth
 
 if TYPE_CHECKING:
     from bimfit.bim.joint import Joint
+    from bimfit.bim.selection import Selection
 
 DEFAULT_METHODS = ("grcsm", "search", "paper", "mrcsm", "icp-point", "icp-plane")
 LOST = 0.010
@@ -100,7 +102,7 @@ def compare(
     *,
     methods: Sequence[str] = DEFAULT_METHODS,
     truth: Path | None = None,
-    joints: Sequence[str] = (),
+    joints: Selection | Sequence[str] = (),
     scan_pose: Array | None = None,
     progress: Progress = lambda step, share: None,
 ) -> Comparison:
@@ -111,15 +113,18 @@ def compare(
     BimfitError
         For an input that cannot be used, or a method that does not exist.
     """
+    from bimfit.bim.selection import Selection
     from bimfit.pipeline.survey import covered_joints, cut_joint, load_scan, model_joints
 
     check_methods(methods)
     truths = read_truth(truth) if truth is not None else ()
-    wanted = list(joints) or [",".join(one.elements) for one in truths]
+    wanted = joints if isinstance(joints, Selection) else Selection(names=tuple(joints))
+    if truths and not wanted.named:
+        wanted = dataclasses.replace(wanted, names=tuple(",".join(one.elements) for one in truths))
     model, found = model_joints(model_path, config.joints, wanted)
     scan = load_scan(scan_path, scan_pose)
     cuts = [
-        cut_joint(model, joint, scan, config) for joint in covered_joints(found, scan, asked=bool(wanted))
+        cut_joint(model, joint, scan, config) for joint in covered_joints(found, scan, asked=wanted.named)
     ]
     cuts = [cut for cut in cuts if cut[1]]
     if not cuts:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,7 @@ from bimfit.bim.stations import design_sections
 from bimfit.config import Config, FitConfig
 from bimfit.errors import JointError
 from bimfit.geometry.line_scan import LineScan, joined
-from bimfit.pipeline.survey import model_joints
+from bimfit.pipeline.survey import by_name, model_joints
 from bimfit.simulation.motion import random_truth
 from bimfit.simulation.rangefinder import aim, simulate_scan
 from bimfit.simulation.scenario import Scenario
@@ -23,6 +23,7 @@ from bimfit.simulation.truth import JointTruth
 if TYPE_CHECKING:
     from bimfit.bim.joint import Joint
     from bimfit.bim.model import Model
+    from bimfit.bim.selection import Selection
     from bimfit.geometry.joint_section import JointSection
 
 
@@ -31,8 +32,9 @@ def simulate(
     scenario: Scenario,
     seed: int,
     *,
-    joints: Sequence[str] = (),
+    joints: Selection | Sequence[str] = (),
     config: Config | None = None,
+    told: Callable[[str], None] = lambda text: None,
 ) -> tuple[LineScan, tuple[JointTruth, ...]]:
     """Move the components of joints at random and scan them, one joint after the other.
 
@@ -43,8 +45,11 @@ def simulate(
         What moves how far, and the sensor.
     seed : int
         The k-th joint uses ``seed + k``.
-    joints : sequence of str
-        Ids or ``GUID,GUID``; empty takes the longest open joint.
+    joints : Selection, or sequence of str
+        Ids or ``GUID,GUID``; empty takes the longest open joint. Of a selection that names no joint, all
+        that it finds, but for those that cannot be looked into.
+    told : callable
+        Told of joints that are left out.
 
     Raises
     ------
@@ -52,16 +57,38 @@ def simulate(
         When the model or a joint cannot be used.
     """
     model, found = model_joints(model_path, (config or Config()).joints, joints)
-    chosen = found if joints else (longest_open(found),)
+    given = bool(joints) if isinstance(joints, Sequence) else joints.given
+    chosen = _scannable(model, found if given else (longest_open(found),), scenario, by_name(joints), told)
     scans, truths = [], []
-    for k, joint in enumerate(chosen):
-        sections = designed(model, joint, scenario)
+    for k, (joint, sections) in enumerate(chosen):
         truth = random_truth(
             sections, scenario, seed + k, joint_id=joint.id, elements=joint.elements, kind=joint.kind
         )
         scans.append(simulate_scan(sections, truth, scenario, seed + k))
         truths.append(truth)
     return joined(scans, f"simulated from {model_path.name}, seed {seed}"), tuple(truths)
+
+
+def _scannable(
+    model: Model,
+    joints: Sequence[Joint],
+    scenario: Scenario,
+    named: bool,
+    told: Callable[[str], None],
+) -> list[tuple[Joint, tuple[JointSection, ...]]]:
+    """The joints with their designed sections; one that has none is left out unless it was named."""
+    found, fault = [], None
+    for joint in joints:
+        try:
+            found.append((joint, designed(model, joint, scenario)))
+        except JointError as error:
+            if named:
+                raise
+            told(f"left out: {error}")
+            fault = error
+    if fault is not None and not found:
+        raise fault
+    return found
 
 
 def designed(model: Model, joint: Joint, scenario: Scenario) -> tuple[JointSection, ...]:

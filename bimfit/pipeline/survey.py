@@ -30,6 +30,7 @@ from bimfit.scan.slicing import cut_slices
 if TYPE_CHECKING:
     from bimfit.bim.joint import Joint
     from bimfit.bim.model import Model
+    from bimfit.bim.selection import Selection
 
 Scan = LineScan | PointCloud
 Cut: TypeAlias = "tuple[Joint, tuple[JointSection, ...], tuple[Slice, ...]]"
@@ -50,7 +51,7 @@ def survey(
     scan_path: Path,
     config: Config,
     *,
-    joints: Sequence[str] = (),
+    joints: Selection | Sequence[str] = (),
     method: str = "grcsm",
     motion: str = "auto",
     scan_pose: Array | None = None,
@@ -62,8 +63,9 @@ def survey(
     ----------
     model_path, scan_path : Path
     config : Config
-    joints : sequence of str
-        Ids or ``GUID,GUID``; empty takes all that the scan covers.
+    joints : Selection, or sequence of str
+        Ids or ``GUID,GUID``; empty takes all that the scan covers. Of a selection that names no joint, too,
+        those that the scan covers.
     method : str
         A name of :data:`bimfit.registration.matchers.MATCHERS`.
     motion : str
@@ -83,17 +85,18 @@ def survey(
     model, found = model_joints(model_path, config.joints, joints)
     progress("reading the scan", 0.0)
     scan = load_scan(scan_path, scan_pose)
-    chosen = covered_joints(found, scan, asked=bool(joints))
+    asked = by_name(joints)
+    chosen = covered_joints(found, scan, asked=asked)
     if not chosen:
         raise ScanError(
-            _far_message(model, scan, bool(joints)),
+            _far_message(model, scan, asked),
             file=scan_path,
             remedy="check its units and its frame; --scan-pose places a scan that is in scanner coordinates",
         )
     results: list[JointResult] = []
     progress("cutting the joints", 0.0)
     cuts = [cut_joint(model, joint, scan, config) for joint in chosen]
-    cuts, partly = (cuts, "") if joints else fully_shown(cuts, config)
+    cuts, partly = (cuts, "") if asked else fully_shown(cuts, config)
     for k, (facing, sections, slices) in enumerate(cuts):
         step = f"joint {facing.id} ({k + 1} of {len(cuts)})"
         results.append(
@@ -110,6 +113,11 @@ def survey(
     said = (*model.notes, *model.left_out(most=3), *scan.notes)
     notes = (*said, *([partly] if partly else []))
     return SurveyResult(model_path, scan_path, model, scan, config, tuple(results), notes)
+
+
+def by_name(joints: Selection | Sequence[str]) -> bool:
+    """Whether joints are asked for one by one."""
+    return bool(joints) if isinstance(joints, Sequence) else joints.named
 
 
 def load_scan(path: Path, pose: Array | None = None) -> Scan:
