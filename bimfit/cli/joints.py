@@ -55,7 +55,10 @@ def _table(model: Model, joints: tuple[Joint, ...]) -> list[str]:
         )
     counts = {state: sum(joint.state == state for joint in joints) for state in joint_states(joints)}
     told = ", ".join(f"{count} {_STATES[state]}" for state, count in counts.items())
-    return [*lines, f"{len(joints)} joints in {len(model.elements)} elements: {told}"]
+    return [
+        *lines,
+        f"{len(joints)} joint{'s' if len(joints) != 1 else ''} in {len(model.elements)} elements: {told}",
+    ]
 
 
 _STATES = {"open": "open", "filled": "filled", "touch": "touching", "clash": "overlapping (clash)"}
