@@ -18,6 +18,8 @@ from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.pose import Array, Pose2D
 from bimfit.geometry.status import Status
 
+FLAG = 16.3
+"""Squared distance from the model beyond which a station disagrees: one in a thousand does by chance."""
 _FEW = 3
 _BETWEEN, _BEYOND = 3.0, 1.0
 """How many spacings from measured neighbours a station may be: between two of them, and past the last."""
@@ -69,7 +71,7 @@ def borrow(
         far, close = max(before, after), min(before, after)
         if far <= _BETWEEN or (math.isinf(far) and close <= _BEYOND):
             changes = _changes(fits, s, agreeing, own, between=math.isfinite(far)) * max(close, 1.0) ** 2
-            made = _made(station, section, fits, i, own, changes)
+            made = _made(station, section, parts, fits, i, own, changes)
             if made is not None:
                 out[i] = made
     return out
@@ -93,6 +95,7 @@ def _changes(
 def _made(
     station: StationEstimate,
     section: JointSection,
+    parts: tuple[Sites, Sites],
     fits: tuple[Trend, Trend],
     i: int,
     own: Sequence[bool],
@@ -106,8 +109,12 @@ def _made(
     poses: list[Pose2D] = list(model)
     spreads: list[Array] = [np.asarray(t.covariance[i] + np.diag(changes)) for t in fits]
     variance = 0.25 * sum(float(np.trace(V[:2, :2])) for V in spreads)
-    if any(own):
-        has = own.index(True)
+    has = own.index(True) if any(own) else None
+    if has is not None and parts[has].known[i] and fits[has].distance[i] <= FLAG:
+        # the one that is measured agrees with the model: nothing shook here
+        spreads[has] = fits[has].covariance[i]
+        variance = 0.25 * sum(float(np.trace(V[:2, :2])) for V in spreads)
+    elif has is not None:
         c = station.components[has]
         assert c.pose is not None and c.covariance is not None
         J = at_corner(c.pose, corners[has])

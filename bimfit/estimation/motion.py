@@ -11,7 +11,7 @@ import numpy as np
 
 from bimfit.errors import ConfigError
 from bimfit.estimation import trend
-from bimfit.estimation.borrow import at_corner, borrow
+from bimfit.estimation.borrow import FLAG, at_corner, borrow
 from bimfit.estimation.result import ComponentEstimate, StationEstimate
 from bimfit.estimation.trend import Basis, Sites, Trend
 from bimfit.geometry.joint_section import JointSection
@@ -19,7 +19,6 @@ from bimfit.geometry.pose import Array, Pose2D
 from bimfit.geometry.status import Status
 
 Motion = Literal["independent", "const", "rigid", "linear", "smooth", "kinked", "auto"]
-_FLAG = 16.3
 _KEEP_KNOT = 30.0
 _KINKED_MARGIN = 20.0
 _FEW = 3
@@ -152,8 +151,10 @@ def _sites(estimates: tuple[StationEstimate, ...], sections: Sequence[JointSecti
     value, precision, step = np.zeros((n, 3)), np.zeros((n, 3, 3)), np.full(n, np.nan)
     for i, (estimate, section) in enumerate(zip(estimates, sections, strict=True)):
         c = estimate.components[which]
-        if c.pose is None or c.covariance is None or not c.status.measured or not estimate.status.measured:
+        if c.pose is None or c.covariance is None or not c.status.measured:
             continue
+        if not estimate.status.measured and estimate.components[1 - which].status.measured:
+            continue  # what is wrong with it is not the other component's alone
         corner = section.gap.mouth[which]
         J = at_corner(c.pose, corner)
         x = _motion_of(c.pose, corner)
@@ -280,7 +281,7 @@ def _apply(
     """Stations with the model's poses, and those that disagree with it."""
     out: list[StationEstimate] = []
     outliers: list[tuple[int, str]] = []
-    agreeing = parts[0].known & parts[1].known & (fits[0].distance <= _FLAG) & (fits[1].distance <= _FLAG)
+    agreeing = parts[0].known & parts[1].known & (fits[0].distance <= FLAG) & (fits[1].distance <= FLAG)
     borrowed = borrow(stations, sections, parts, fits, agreeing)
     for i, (station, section) in enumerate(zip(stations, sections, strict=True)):
         if i in borrowed:
@@ -294,18 +295,36 @@ def _apply(
                 components.append(c)
                 continue
             corner = section.gap.mouth[which]
-            pose = Pose2D.about(corner, *(float(x) for x in t.value[i]))
-            J = np.linalg.inv(at_corner(pose, corner))
-            if t.distance[i] > _FLAG:
+            pose, covariance = _mixed(parts[which], t, i, corner, c)
+            if t.distance[i] > FLAG:
                 outliers.append((i, "AB"[which]))
                 off = float(np.hypot(*(parts[which].value[i] - t.value[i])[:2])) * 1e3
                 reason = f"its own returns put it {off:.1f} mm away from what its neighbours say"
                 if status.name == "ok":
                     status = Status("ambiguous", f"component {'AB'[which]}: {reason}")
                 if c.status.name == "ok":
-                    # A spike: a jump that no model of the motion has. What was measured well, stands.
-                    components.append(replace(c, status=Status("ambiguous", reason)))
-                    continue
-            components.append(replace(c, pose=pose, covariance=J @ t.covariance[i] @ J.T))
+                    c = replace(c, status=Status("ambiguous", reason))
+            components.append(replace(c, pose=pose, covariance=covariance))
         out.append(replace(station, components=(components[0], components[1]), status=status))
     return tuple(out), tuple(outliers)
+
+
+def _mixed(sites: Sites, t: Trend, i: int, corner: Array, c: ComponentEstimate) -> tuple[Pose2D, Array]:
+    """Pose and covariance of a station that follows the model or, maybe, has jumped.
+
+    A jump is no part of any model of the motion: where one is likely, what was measured well stands. Where
+    it is uncertain, the two are weighed, and their difference counts as uncertainty.
+    """
+    x, V = t.value[i], t.covariance[i]
+    w = float(t.jump[i]) if c.status.name == "ok" else 0.0
+    if w > 1e-3:
+        own, apart = sites.value[i], sites.value[i] - x
+        # a station may say nothing about one direction
+        spread = np.linalg.inv(sites.precision[i] + np.diag([400.0, 400.0, 4.0]))
+        x = x + w * apart
+        V = (1.0 - w) * V + w * spread + w * (1.0 - w) * np.outer(apart, apart)
+        if w > 1.0 - 1e-3:
+            x = own
+    pose = Pose2D.about(corner, *(float(y) for y in x))
+    J = np.linalg.inv(at_corner(pose, corner))
+    return pose, J @ V @ J.T

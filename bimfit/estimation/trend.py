@@ -15,6 +15,10 @@ from bimfit.geometry.pose import Array
 
 Mask = NDArray[np.bool_]
 _NU = 4.0
+_JUMP = np.array([0.004, 0.004, 0.035])
+"""What a station that jumps is off by, standard deviations in u, v (m) and theta (rad)."""
+_JUMPS = 0.01
+"""Share of stations that jump."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,8 @@ class Trend:
         What each station counted for; 1 where it agrees.
     distance : ndarray, shape (n,)
         Squared Mahalanobis distance of each station from the fit without it; 0 where unknown.
+    jump : ndarray, shape (n,)
+        Probability that a station is off by more than noise explains, such as a sensor that was knocked.
     deviance : float
         -2 log likelihood of the stations, Student with 4 degrees of freedom, up to a constant.
     freedom : float
@@ -65,6 +71,7 @@ class Trend:
     covariance: Array
     weight: Array
     distance: Array
+    jump: Array
     deviance: float
     freedom: float
 
@@ -153,7 +160,7 @@ def fit(sites: Sites, basis: Basis, *, rounds: int = 4) -> Trend:
     weight = np.ones(n)
     for _ in range(rounds):
         beta, cov, design = solve(sites, basis, weight)
-        distance = _left_out(sites, weight, beta, cov, design)
+        distance, _ = _left_out(sites, weight, beta, cov, design)
         new = np.minimum((_NU + 3.0) / (_NU + distance), 1.0)
         done = float(np.abs(new - weight).max()) < 0.01
         weight = new
@@ -172,11 +179,15 @@ def fit(sites: Sites, basis: Basis, *, rounds: int = 4) -> Trend:
     )
     V = np.einsum("iaf,fg,ibg->iab", design, cov, design, optimize=True)
     V = V + _shared_cells(sites, weight, cov, design)
-    return Trend(value, V, weight, _left_out(sites, weight, beta, cov, design), deviance, freedom)
+    distance, jump = _left_out(sites, weight, beta, cov, design)
+    return Trend(value, V, weight, distance, jump, deviance, freedom)
 
 
-def _left_out(sites: Sites, weight: Array, beta: Array, cov: Array, design: Array) -> Array:
-    """Squared Mahalanobis distance of every station from the fit to the others."""
+def _left_out(sites: Sites, weight: Array, beta: Array, cov: Array, design: Array) -> tuple[Array, Array]:
+    """Squared Mahalanobis distance of every station from the fit to the others; how likely it has jumped.
+
+    The latter is the posterior probability of a residual N(0, S + J) against N(0, S), J that of a jump.
+    """
     V = _blocks(cov, design)
     # regularised, for a station may say nothing about one direction
     C = np.linalg.inv(sites.precision + np.diag([400.0, 400.0, 4.0]))
@@ -186,8 +197,13 @@ def _left_out(sites: Sites, weight: Array, beta: Array, cov: Array, design: Arra
     e = sites.value - design @ beta
     e = e + np.einsum("iab,ib->ia", gain, e)
     spread = C + V + gain @ V
-    out = np.einsum("ia,ia->i", e, np.linalg.solve(spread, e[:, :, None])[:, :, 0])
-    return np.where(sites.known, np.maximum(out, 0.0), 0.0)
+    near = np.einsum("ia,ia->i", e, np.linalg.solve(spread, e[:, :, None])[:, :, 0])
+    wide = spread + np.diag(_JUMP**2)
+    far = np.einsum("ia,ia->i", e, np.linalg.solve(wide, e[:, :, None])[:, :, 0])
+    odds = 0.5 * (near - far - np.linalg.slogdet(wide)[1] + np.linalg.slogdet(spread)[1])
+    odds = np.clip(odds + np.log(_JUMPS / (1.0 - _JUMPS)), -50.0, 50.0)
+    known = sites.known
+    return np.where(known, np.maximum(near, 0.0), 0.0), np.where(known, 1.0 / (1.0 + np.exp(-odds)), 0.0)
 
 
 def _shared_cells(sites: Sites, weight: Array, cov: Array, design: Array) -> Array:

@@ -106,6 +106,34 @@ def test_a_jump_is_flagged_and_does_not_pull_its_neighbours():
     assert error[40] > 2e-3  # what was measured well stands, even where no neighbour has it
 
 
+def test_a_station_off_by_what_chance_explains_is_flagged_but_follows_the_joint():
+    rng = np.random.default_rng(5)
+    truth = _truth("linear", rng)
+    moved = truth.copy()
+    stations = _stations(rng, moved)
+    off = np.array([0.0, 4.4 * SD[1], 0.0])
+    arm = Pose2D.about(CORNERS[0], *(truth[0, 40] + off))
+    a = dataclasses.replace(stations[40].components[0], pose=arm)
+    stations[40] = dataclasses.replace(stations[40], components=(a, stations[40].components[1]))
+    result = estimate_joint(stations, _sections(), "linear")
+    assert (40, "A") in result.outliers
+    assert result.stations[40].status.name == "ambiguous"
+    # 4.4 deviations are a jump in a hundred joints at most: half way would be a compromise with chance
+    assert abs(_errors(result, truth)[0, 40, 1]) < 0.4 * off[1]
+
+
+def test_the_component_that_is_measured_follows_the_joint_where_the_other_is_lost():
+    rng = np.random.default_rng(6)
+    truth = _truth("linear", rng)
+    stations = _stations(rng, truth)
+    for i in (20, 30, 50, 60):
+        _lose(stations, i, which=(0,))
+    result = estimate_joint(stations, _sections(), "linear")
+    assert {result.stations[i].status.name for i in (20, 30, 50, 60)} == {"weak"}
+    alone = _errors(dataclasses.replace(result, stations=tuple(stations[:20])), truth[:, :20])
+    assert np.abs(_errors(result, truth)[:, [20, 30, 50, 60], :2]).max() < 0.5 * np.abs(alone[..., :2]).max()
+
+
 LOST = Status("rejected", "only 3 returns lie on the component")
 
 
