@@ -1,8 +1,30 @@
-"""Scan files: one registry, a file a format."""
+"""Scan files: one registry, a file a format.
+
+A file may be larger than memory. :func:`scan_chunks` gives a scan in pieces, and whoever needs only what lies
+near some places says so by ``ReadOptions.boxes``. A format takes part by ``chunks`` beside ``read``::
+
+    def las_chunks(path: Path, options: ReadOptions) -> Iterator[PointCloud]: ...
+    Format("LAS", (".las", ".laz"), _plain(read_las), None, (b"LASF",), chunks=las_chunks)
+
+- It yields ``PointCloud`` (or ``LineScan``) pieces in the file's order and unit, float64, of about a million
+  points, never holding more than a piece or two; what it cannot read is an error as for ``read``, at the
+  latest at the end. A file without any point is an error; without any point in the boxes it is not.
+- ``options.file_boxes(unit)`` are in the file's own coordinates and unit. A reader *may* leave out what lies
+  outside all of them (``Boxes.of(...)``: an octree's nodes by :meth:`Boxes.meets`, points by
+  :meth:`Boxes.inside` or, before they are made floats, :meth:`Boxes.find`); it need not, the caller looks
+  again. None asks for everything.
+- Each piece carries the viewpoint that its own points were seen from, and the notes that apply to it; equal
+  notes are reported once. Pieces of one file are all clouds or all line scans. The sweeps of line-scan pieces
+  are numbered for the whole file: a sweep may go on from one piece to the next.
+- A reader without ``chunks`` gives one piece, whole.
+
+``tests/scan/test_chunks.py`` holds every format to the same points in pieces as whole.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,7 +33,7 @@ from bimfit.files import whole_file
 from bimfit.geometry.line_scan import LineScan
 from bimfit.scan.cloud import PointCloud
 from bimfit.scan.formats.delimited import read_csv, write_csv
-from bimfit.scan.formats.las import read_las
+from bimfit.scan.formats.las import las_chunks, read_las
 from bimfit.scan.formats.npz import read_npz, write_npz
 from bimfit.scan.formats.options import ANY, ReadOptions
 from bimfit.scan.formats.packing import GZIP, unpacked
@@ -49,6 +71,8 @@ class Format:
         Metres a unit of length where nothing else is said.
     sized : bool
         Whether the reader itself turns all lengths into metres (pictures, whose pixels have sizes).
+    chunks : callable or None
+        (path, options) -> pieces of the scan; None where the file is only read whole.
     """
 
     name: str
@@ -60,6 +84,7 @@ class Format:
     beams: bool = False
     unit: float = 1.0
     sized: bool = False
+    chunks: Callable[[Path, ReadOptions], Iterator[Scan]] | None = None
 
 
 def _plain(read: Callable[[Path], Scan]) -> Callable[[Path, ReadOptions], Scan]:
@@ -72,7 +97,7 @@ FORMATS: tuple[Format, ...] = (
     Format("NPZ", (".npz",), _plain(read_npz), write_npz, (b"PK\x03\x04",), beams=True),
     Format("PLY", (".ply",), _plain(read_ply), write_ply, (b"ply\n", b"ply\r\n")),
     Format("PCD", (".pcd",), _plain(read_pcd), write_pcd, (b"# .PCD", b"VERSION 0.7", b"VERSION .7")),
-    Format("LAS", (".las", ".laz"), _plain(read_las), None, (b"LASF",)),
+    Format("LAS", (".las", ".laz"), _plain(read_las), None, (b"LASF",), chunks=las_chunks),
     Format("PTX", (".ptx",), _plain(read_ptx)),
     Format("XYZ", (".xyz", ".txt", ".pts", ".asc"), _plain(read_xyz), write_xyz),
 )
@@ -96,29 +121,55 @@ def read_scan(path: str | Path, unit: float | None = None, options: ReadOptions 
     ScanError
         In one clear line, when the file cannot be read or holds no scan.
     """
-    source = Path(path)
     if unit is not None:
         options = replace(options, unit=unit)
+    with _opened(Path(path)) as (form, inner):
+        scan = _in_metres(form.read(inner, options), form, options, Path(path))
+    said = summary(scan, form.name, options.unit or form.unit)
+    return replace(scan, notes=(*scan.notes, said))
+
+
+def scan_chunks(path: str | Path, options: ReadOptions = ANY) -> Iterator[Scan]:
+    """Read a scan in pieces, in the file's order, never holding more than a few of them.
+
+    Parameters
+    ----------
+    path : str or Path
+    options : ReadOptions
+        Points outside ``options.boxes`` may be left out, so that a file with an index is not read whole.
+
+    Raises
+    ------
+    ScanError
+        In one clear line, while the pieces are drawn.
+    """
+    with _opened(Path(path)) as (form, inner):
+        read = form.chunks or (lambda path, options: iter((form.read(path, options),)))
+        for piece in read(inner, options):
+            yield _in_metres(piece, form, options, Path(path))
+
+
+@contextmanager
+def _opened(source: Path) -> Iterator[tuple[Format, Path]]:
+    """A file's format, and where it lies unpacked; errors name the file that the user named."""
     if source.is_dir():
         raise ScanError("is a folder", file=source, remedy="name a scan file")
     head = first_lines(source)
-    if head.startswith(GZIP):
-        with unpacked(source) as inner:
-            return _read(format_of(inner, first_lines(inner)), inner, options, str(source))
-    return _read(format_of(source, head), source, options)
+    if not head.startswith(GZIP):
+        yield format_of(source, head), source
+        return
+    with unpacked(source) as inner:
+        try:
+            yield format_of(inner, first_lines(inner)), inner
+        except ScanError as error:
+            raise ScanError(error.message, file=source, place=error.place, remedy=error.remedy) from error
 
 
-def _read(form: Format, path: Path, options: ReadOptions, source: str = "") -> Scan:
-    try:
-        scan = form.read(path, options)
-    except ScanError as error:
-        if not source:
-            raise
-        raise ScanError(error.message, file=source, place=error.place, remedy=error.remedy) from error
+def _in_metres(scan: Scan, form: Format, options: ReadOptions, source: Path) -> Scan:
     unit = options.unit or form.unit
     if unit != 1.0 and not form.sized:
         scan = scaled(scan, unit)
-    return replace(scan, source=source or scan.source, notes=(*scan.notes, summary(scan, form.name, unit)))
+    return replace(scan, source=str(source))
 
 
 def write_scan(scan: Scan, path: str | Path) -> None:

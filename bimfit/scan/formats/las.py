@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from bimfit.errors import ScanError
+from bimfit.geometry.pose import Array
+from bimfit.scan.boxes import Boxes
 from bimfit.scan.cloud import PointCloud, usable
+from bimfit.scan.formats.options import ANY, ReadOptions
 
-_CHUNK = 1_000_000
+_CHUNK = 500_000
 
 
 def read_las(path: Path) -> PointCloud:
@@ -21,21 +28,69 @@ def read_las(path: Path) -> PointCloud:
     ScanError
         When it is no such file, is cut short, holds no point, or laspy is not installed.
     """
+    pieces = list(las_chunks(path, ANY))
+    return replace(
+        pieces[0],
+        points=np.concatenate([piece.points for piece in pieces]),
+        intensity=np.concatenate([np.zeros(0) if p.intensity is None else p.intensity for p in pieces]),
+    )
+
+
+def las_chunks(path: Path, options: ReadOptions) -> Iterator[PointCloud]:
+    """Read a LAS or LAZ file in pieces; points outside the boxes are dropped before they become floats.
+
+    Raises
+    ------
+    ScanError
+        As :func:`read_las` does, at the latest after the last piece.
+    """
     try:
         import laspy
     except ImportError as error:
         raise ScanError(
             "reading LAS needs the package laspy", file=path, remedy='pip install "bimfit[las]"'
         ) from error
-    points, intensity = [], []
+    wanted = options.file_boxes(1.0)
+    boxes = None if wanted is None else Boxes.of(wanted)
+    seen = good = 0
+    with _named_errors(path), laspy.open(path) as reader:
+        header = reader.header
+        scale, offset = np.asarray(header.scales, float), np.asarray(header.offsets, float)
+        step = float(np.max(np.abs(scale)))
+        notes = (f"coordinates are stored in steps of {step:g} units",) if step > 5e-4 else ()
+        for chunk in reader.chunk_iterator(_CHUNK):
+            seen += len(chunk)
+            piece = _piece(path, chunk, scale, offset, boxes, notes)
+            good += len(chunk) if boxes is not None else len(piece)
+            yield piece
+        count = int(header.point_count)
+    if seen and seen < count:
+        raise ScanError(f"cut short: {seen} of {count} points", file=path)
+    if not good:
+        raise ScanError("the file holds no point", file=path)
+
+
+def _piece(
+    path: Path, chunk: Any, scale: Array, offset: Array, boxes: Boxes | None, notes: tuple[str, ...]
+) -> PointCloud:
+    if boxes is not None:
+        raw = chunk.array
+        chunk = chunk[boxes.find(raw["X"], raw["Y"], raw["Z"], scale, offset)[0]]
+    points = np.stack([np.asarray(getattr(chunk, axis), np.float64) for axis in "xyz"], axis=1)
+    intensity = np.asarray(chunk.intensity, np.float64)
+    keep = usable(points)
+    if not keep.all():
+        points, intensity = points[keep], intensity[keep]
+    return PointCloud(points, intensity=intensity, source=str(path), notes=notes)
+
+
+@contextmanager
+def _named_errors(path: Path) -> Iterator[None]:
+    """Turn what laspy raises on damaged files into one clear line."""
+    import laspy
+
     try:
-        with laspy.open(path) as reader:
-            count, scales = reader.header.point_count, np.asarray(reader.header.scales, float)
-            for chunk in reader.chunk_iterator(_CHUNK):
-                points.append(
-                    np.stack([np.asarray(getattr(chunk, axis), np.float64) for axis in "xyz"], axis=1)
-                )
-                intensity.append(np.asarray(chunk.intensity, np.float64))
+        yield
     except OSError as error:
         raise ScanError(f"cannot be read: {error.strerror or error}", file=path) from error
     except (
@@ -48,14 +103,3 @@ def read_las(path: Path) -> PointCloud:
         laspy.LaspyException,
     ) as error:
         raise ScanError(f"not a LAS file, or damaged: {error}", file=path) from error
-    found = np.concatenate(points) if points else np.zeros((0, 3))
-    if not len(found):
-        raise ScanError("the file holds no point", file=path)
-    if len(found) < count:
-        raise ScanError(f"cut short: {len(found)} of {count} points", file=path)
-    keep = usable(found)
-    if not keep.any():
-        raise ScanError("the file holds no point", file=path)
-    step = float(np.max(np.abs(scales)))
-    notes = (f"coordinates are stored in steps of {step:g} units",) if step > 5e-4 else ()
-    return PointCloud(found[keep], intensity=np.concatenate(intensity)[keep], source=str(path), notes=notes)
