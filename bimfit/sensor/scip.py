@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bimfit.errors import SensorError
+from bimfit.geometry.range_codes import FIRST_MEASUREMENT as FIRST_MEASUREMENT
+from bimfit.geometry.range_codes import reason as reason
 
 IntArray = NDArray[np.int64]
 FloatArray = NDArray[np.float64]
@@ -23,21 +25,6 @@ FloatArray = NDArray[np.float64]
 LINE = 64  # characters of data a line, without its sum
 STRING = re.compile(r"[A-Za-z0-9 ._+@]{1,16}")
 SCAN_REQUEST = re.compile(rb"([MG])([DS])(\d{4})(\d{4})(\d{2})(?:(\d)(\d{2}))?(?:;([A-Za-z0-9 ._+@]{1,16}))?")
-FIRST_MEASUREMENT = 20  # values below are codes
-
-REASONS: Mapping[int, str] = MappingProxyType(
-    {
-        0: "nothing in range (possibly 22 m)",
-        1: "low intensity",
-        2: "low intensity",
-        6: "measurement failed",
-        7: "neighbouring steps failed",
-        8: "intensities do not match",
-        9: "same step failed twice",
-        18: "strong reflector",
-        19: "not measurable",
-    }
-)
 
 _SCAN_STATUS = {
     "00": "accepted",
@@ -314,13 +301,6 @@ def accepted(name: str, status: str) -> bool:
     """Whether things are as the request ``name`` wanted them after this status."""
     key = name[:2] if name[:2] in STATUS else name
     return status == "00" or status in _HARMLESS.get(key, ()) or (status == "99" and key in ("MD", "MS"))
-
-
-def reason(code: int) -> str:
-    """Why a value below 20 is not a measurement."""
-    if code < 0 or code >= FIRST_MEASUREMENT:
-        raise ValueError(f"{code} is no error code")
-    return REASONS.get(code, "measurement failed")
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ def test_units_that_are_none(tmp_path):
         with pytest.raises(ScanError, match="unit"):
             ReadOptions(unit=bad)
     with pytest.raises(ScanError, match="pixel"):
-        ReadOptions(pixel=(0.1, -1.0, None))
+        ReadOptions(pixel=(0.1, 0.0, None))
 
 
 def test_what_was_read_is_said(tmp_path, line_scan, cloud):

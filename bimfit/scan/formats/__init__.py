@@ -32,13 +32,17 @@ from bimfit.errors import ExportError, ScanError
 from bimfit.files import whole_file
 from bimfit.geometry.line_scan import LineScan
 from bimfit.scan.cloud import PointCloud
+from bimfit.scan.formats.carmen import looks_like_carmen, read_carmen
 from bimfit.scan.formats.delimited import read_csv, write_csv
+from bimfit.scan.formats.hokuyo_logs import looks_like_breezy, looks_like_ubh, read_breezy, read_ubh
 from bimfit.scan.formats.las import las_chunks, read_las
 from bimfit.scan.formats.npz import read_npz, write_npz
 from bimfit.scan.formats.options import ANY, ReadOptions
 from bimfit.scan.formats.packing import GZIP, unpacked
 from bimfit.scan.formats.pcd import read_pcd, write_pcd
+from bimfit.scan.formats.pictures import looks_like_sick, read_npy, read_png, read_sick, read_tiff
 from bimfit.scan.formats.ply import read_ply, write_ply
+from bimfit.scan.formats.profiles import looks_like_profiles, read_profiles
 from bimfit.scan.formats.ptx import read_ptx
 from bimfit.scan.formats.summary import summary
 from bimfit.scan.formats.text import first_lines
@@ -99,6 +103,21 @@ FORMATS: tuple[Format, ...] = (
     Format("PCD", (".pcd",), _plain(read_pcd), write_pcd, (b"# .PCD", b"VERSION 0.7", b"VERSION .7")),
     Format("LAS", (".las", ".laz"), _plain(read_las), None, (b"LASF",), chunks=las_chunks),
     Format("PTX", (".ptx",), _plain(read_ptx)),
+    Format("CARMEN log", (".clf",), _plain(read_carmen), looks=looks_like_carmen),
+    Format("UBH", (".ubh",), _plain(read_ubh), looks=looks_like_ubh, unit=1e-3),
+    Format("BreezySLAM", (".dat",), _plain(read_breezy), looks=looks_like_breezy, unit=1e-3),
+    Format("SICK height map", (".json",), read_sick, looks=looks_like_sick, sized=True, unit=1e-3),
+    Format("PNG height map", (".png",), read_png, None, (b"\x89PNG\r\n\x1a\n",), sized=True),
+    Format(
+        "TIFF height map",
+        (".tif", ".tiff"),
+        read_tiff,
+        None,
+        (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"),
+        sized=True,
+    ),
+    Format("array", (".npy",), read_npy, None, (b"\x93NUMPY",), sized=True),
+    Format("profiles", (), read_profiles, looks=looks_like_profiles, sized=True, unit=1e-3),
     Format("XYZ", (".xyz", ".txt", ".pts", ".asc"), _plain(read_xyz), write_xyz),
 )
 

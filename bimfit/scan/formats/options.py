@@ -30,7 +30,7 @@ class ReadOptions:
         Which topic of a ROS bag; empty takes the only one.
     pixel : tuple of 3 float or None
         Of height maps and profiles: distance between columns, distance between rows, and height of one
-        count, m; None for those that the file names itself.
+        count, m; None for those that the file names itself. A negative distance mirrors the map.
     boxes : ndarray, shape (k, 2, 3), or None
         Least and greatest corners, m, of the places that matter; formats that have an index leave the rest
         of the file alone. Other formats read everything.
@@ -45,8 +45,8 @@ class ReadOptions:
         if self.unit is not None and not (math.isfinite(self.unit) and self.unit > 0.0):
             raise ScanError(f"a unit must be a positive number of metres, got {self.unit}")
         for size in self.pixel:
-            if size is not None and not (math.isfinite(size) and size > 0.0):
-                raise ScanError(f"a pixel's sizes must be positive numbers of metres, got {size}")
+            if size is not None and not (math.isfinite(size) and size != 0.0):
+                raise ScanError(f"a pixel's sizes must be numbers of metres and not 0, got {size}")
         if self.boxes is not None and np.asarray(self.boxes).shape[1:] != (2, 3):
             raise ScanError("boxes must have the shape (k, 2, 3)")
 
