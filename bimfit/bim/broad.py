@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bimfit.bim.faces import Faces, Index
+from bimfit.bim.faces import Faces, Index, dot
 from bimfit.geometry.pose import Array
 
 _MARGIN = 2e-3
@@ -18,7 +18,7 @@ def face_pairs(
     max_overlap: float,
     min_cosine: float,
     max_cosine: float,
-    eligible: NDArray[np.bool_],
+    chosen: NDArray[np.bool_],
 ) -> tuple[Index, Index]:
     """Pairs of faces of different elements that turn towards each other and lie near.
 
@@ -29,25 +29,25 @@ def face_pairs(
         How far a face looks out along its normal, and back into its element, m.
     min_cosine, max_cosine : float
         Bounds of ``-n_a . n_b``: 1 for faces that are parallel and face each other.
-    eligible : ndarray, shape (elements,)
-        Which elements take part.
+    chosen : ndarray of bool, shape (faces,)
+        Which faces take part.
 
     Returns
     -------
     a, b : ndarray, shape (k,)
         Faces; the element of a has the lower number. Sorted.
     """
-    chosen = np.flatnonzero(eligible[faces.element])
-    low, high = faces.low[chosen], faces.high[chosen]
-    reach = faces.normal[chosen] * max_gap
-    back = -faces.normal[chosen] * max_overlap
+    some = np.flatnonzero(chosen)
+    low, high = faces.low[some], faces.high[some]
+    reach = faces.normal[some] * max_gap
+    back = -faces.normal[some] * max_overlap
     wide_low = np.minimum(np.minimum(low, low + reach), low + back) - _MARGIN
     wide_high = np.maximum(np.maximum(high, high + reach), high + back) + _MARGIN
     i, j = box_pairs(wide_low, wide_high, low, high)
-    a, b = chosen[i], chosen[j]
+    a, b = some[i], some[j]
     near = faces.element[a] < faces.element[b]
     a, b = a[near], b[near]
-    cosine = -np.einsum("ij,ij->i", faces.normal[a], faces.normal[b])
+    cosine = -dot(faces.normal[a], faces.normal[b])
     good = (cosine >= min_cosine) & (cosine <= max_cosine)
     a, b = a[good], b[good]
     order = np.lexsort((b, a))

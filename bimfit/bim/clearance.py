@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bimfit.bim.broad import box_pairs
-from bimfit.bim.faces import Faces, Index, ranges
+from bimfit.bim.faces import Faces, Index, cross, dot, overlapping, ranges
 from bimfit.bim.narrow import PairFrames
 from bimfit.bim.strips import Strips, piece_centroids
 from bimfit.geometry.pose import Array
@@ -107,8 +107,8 @@ def _hits(
     way = frames.m[pair]
     end = start + reach[:, None] * way
     heads = np.flatnonzero(np.diff(strip, prepend=-1))
-    low = np.minimum.reduceat(np.minimum(start, end), heads) - 2.0 * _END
-    high = np.maximum.reduceat(np.maximum(start, end), heads) + 2.0 * _END
+    low_s, high_s = np.minimum(start, end) - 2.0 * _END, np.maximum(start, end) + 2.0 * _END
+    low, high = np.minimum.reduceat(low_s, heads), np.maximum.reduceat(high_s, heads)
     sizes = np.diff(np.append(heads, len(strip)))
     group, triangle = nearby_triangles(faces, low, high)
     found: list[tuple[Index, Index, NDArray[np.bool_]]] = []
@@ -120,24 +120,24 @@ def _hits(
         g, t = group[position:stop], triangle[position:stop]
         sample = ranges(heads[g], sizes[g])
         tri = np.repeat(t, sizes[g])
+        near = overlapping(low_s[sample], high_s[sample], faces.triangle_low[tri], faces.triangle_high[tri])
+        sample, tri = sample[near], tri[near]
         distance = ray_distance(start[sample], way[sample], faces.triangles[tri])
         hit = np.flatnonzero(np.isfinite(distance))
         sample, tri, distance = sample[hit], tri[hit], distance[hit]
-        near, far = np.minimum(0.0, reach[sample]), np.maximum(0.0, reach[sample])
+        first, last = np.minimum(0.0, reach[sample]), np.maximum(0.0, reach[sample])
         owner = faces.owner[tri]
         mine = (owner == faces.element[frames.a[pair[sample]]]) | (
             owner == faces.element[frames.b[pair[sample]]]
         )
         corners = faces.triangles[tri]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        cosine = np.einsum("ij,ij->i", normal, way[sample]) / np.maximum(
-            np.linalg.norm(normal, axis=1), 1e-300
-        )
-        inside = (distance > near + _INSIDE) & (distance < far - _INSIDE)
+        normal = cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        cosine = dot(normal, way[sample]) / np.maximum(np.sqrt(dot(normal, normal)), 1e-300)
+        inside = (distance > first + _INSIDE) & (distance < last - _INSIDE)
         # a filler that fits exactly: it begins where A ends, or ends where B begins
-        begins = (np.abs(distance - near) <= _END) & (cosine < -0.5)
-        ends = (np.abs(distance - far) <= _END) & (cosine > 0.5)
-        own = mine & (distance > near + _OWN) & (distance < far - _OWN)
+        begins = (np.abs(distance - first) <= _END) & (cosine < -0.5)
+        ends = (np.abs(distance - last) <= _END) & (cosine > 0.5)
+        own = mine & (distance > first + _OWN) & (distance < last - _OWN)
         keep = own | (~mine & (inside | begins | ends))
         found.append((sample[keep], owner[keep], own[keep]))
         position = stop
@@ -167,9 +167,7 @@ def nearby_triangles(faces: Faces, low: Array, high: Array) -> tuple[Index, Inde
         some = slice(position, stop)
         b = np.repeat(box[some], sizes[some])
         t = ranges(faces.starts[element[some]], sizes[some])
-        near = np.all(faces.triangle_low[t] <= high[b], axis=1) & np.all(
-            faces.triangle_high[t] >= low[b], axis=1
-        )
+        near = overlapping(low[b], high[b], faces.triangle_low[t], faces.triangle_high[t])
         out_box.append(b[near])
         out_triangle.append(t[near])
         position = stop
@@ -191,13 +189,13 @@ def ray_distance(start: Array, way: Array, triangles: Array) -> Array:
     """
     origin = triangles[:, 0]
     e1, e2 = triangles[:, 1] - origin, triangles[:, 2] - origin
-    h = np.cross(way, e2)
-    det = np.einsum("ij,ij->i", e1, h)
+    h = cross(way, e2)
+    det = dot(e1, h)
     flat = np.abs(det) < 1e-14
     inverse = 1.0 / np.where(flat, 1.0, det)
     s = start - origin
-    u = np.einsum("ij,ij->i", s, h) * inverse
-    q = np.cross(s, e1)
-    v = np.einsum("ij,ij->i", way, q) * inverse
+    u = dot(s, h) * inverse
+    q = cross(s, e1)
+    v = dot(way, q) * inverse
     hit = ~flat & (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1.0 + 1e-9)
-    return np.where(hit, np.einsum("ij,ij->i", e2, q) * inverse, np.inf)
+    return np.where(hit, dot(e2, q) * inverse, np.inf)

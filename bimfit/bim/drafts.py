@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bimfit.bim.bands import middle_line
 from bimfit.bim.broad import face_pairs
 from bimfit.bim.clearance import judge
-from bimfit.bim.faces import Faces, Index, find_faces
+from bimfit.bim.faces import Faces, Index, cross, dot, find_faces, overlapping
 from bimfit.bim.kind import Stations, classify, free_sides
 from bimfit.bim.merge import Leg, merge
 from bimfit.bim.narrow import PairFrames, facing_pieces, pair_frames
@@ -71,7 +71,7 @@ def find_drafts(meshes: Sequence[TriangleMesh], eligible: NDArray[np.bool_], lim
         max_overlap=limits.max_overlap,
         min_cosine=math.cos(limits.max_angle),
         max_cosine=1.1,
-        eligible=eligible,
+        chosen=eligible[faces.element],
     )
     frames = pair_frames(faces, a, b)
     found = _strips(faces, frames, limits, -limits.max_overlap)
@@ -101,41 +101,26 @@ def _legs(faces: Faces, frames: PairFrames, strips: Strips, limits: Limits) -> d
     kept = np.flatnonzero(verdict.state != "own")
     strips, state, filler = strips.take(kept), verdict.state[kept], verdict.filler[kept]
     half = 0.5 * strips.length[:, None] * strips.axis
-    ends = [_mid_gap(frames, strips.pair, strips.centre + sign * half) for sign in (-1.0, 1.0)]
+    ends = np.stack(
+        [_mid_gap(frames, strips.pair, strips.centre + sign * half) for sign in (-1.0, 1.0)], axis=1
+    )
     m = frames.m[strips.pair]
-    element_a, element_b = faces.element[frames.a[strips.pair]], faces.element[frames.b[strips.pair]]
+    first, second = (faces.element[side[strips.pair]].tolist() for side in (frames.a, frames.b))
+    plain = (strips.depth, strips.length, strips.gap, strips.gap_min, strips.gap_max, strips.area)
+    depths, lengths, gaps, lows, highs, areas = (values.tolist() for values in plain)
     full = strips.area >= _FULL * strips.length * strips.depth
     groups: dict[Key, list[Leg]] = defaultdict(list)
-    for k in range(len(strips.pair)):
-        key = (int(element_a[k]), int(element_b[k]), str(state[k]), int(filler[k]))
-        points, u, depth, length, closed = (
-            np.stack([ends[0][k], ends[1][k]]),
-            m[k : k + 1],
-            float(strips.depth[k]),
-            float(strips.length[k]),
-            False,
-        )
+    for k, key in enumerate(zip(first, second, state.tolist(), filler.tolist(), strict=True)):
+        points, u, depth, length, closed = ends[k], m[k : k + 1], depths[k], lengths[k], False
         band = None if full[k] else _band(strips, k)
         if band is not None:
             line, closed = band
             pair = np.full(len(line), strips.pair[k])
             points, u = _mid_gap(frames, pair, line), np.repeat(u, len(line) - 1, axis=0)
             length = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
-            depth = float(strips.area[k]) / length
-        groups[key].append(
-            Leg(
-                points=points,
-                u=u,
-                length=length,
-                depth=depth,
-                gap=float(strips.gap[k]),
-                low=float(strips.gap_min[k]),
-                high=float(strips.gap_max[k]),
-                area=float(strips.area[k]),
-                closed=closed,
-                legs=(length,),
-            )
-        )
+            depth = areas[k] / length
+        leg = Leg(points, u, length, depth, gaps[k], lows[k], highs[k], areas[k], (length,), closed)
+        groups[key].append(leg)
     return groups
 
 
@@ -162,11 +147,15 @@ def _add_grooves(
         max_overlap=0.0,
         min_cosine=math.cos(max(_GROOVE, limits.max_angle)),
         max_cosine=math.cos(limits.max_angle),
-        eligible=eligible,
+        chosen=slim & eligible[faces.element],
     )
     count = len(faces.starts)
     taken = np.unique([key[0] * count + key[1] for key in groups]) if groups else np.zeros(0, np.int64)
-    fresh = ~np.isin(faces.element[a] * count + faces.element[b], taken) & slim[a] & slim[b]
+    fresh = ~np.isin(faces.element[a] * count + faces.element[b], taken)
+    # they come as near as the root is wide
+    fresh &= overlapping(
+        faces.low[a] - _GROOVE_ROOT, faces.high[a] + _GROOVE_ROOT, faces.low[b], faces.high[b]
+    )
     if not fresh.any():
         return
     frames = pair_frames(faces, a[fresh], b[fresh])
@@ -228,10 +217,10 @@ def _longest(leg: Leg) -> int:
 
 def _axes(way: Array, across: Array) -> tuple[Array, Array, Array]:
     """Unit n, u and v = n x u from directions (k, 3) along and across."""
-    n = way / np.linalg.norm(way, axis=1, keepdims=True)
-    u = across - np.einsum("ij,ij->i", across, n)[:, None] * n
-    u = u / np.linalg.norm(u, axis=1, keepdims=True)
-    return n, u, np.cross(n, u)
+    n = way / np.sqrt(dot(way, way))[:, None]
+    u = across - dot(across, n)[:, None] * n
+    u = u / np.sqrt(dot(u, u))[:, None]
+    return n, u, cross(n, u)
 
 
 def _spots(legs: Sequence[Leg], start: Array, end: Array, u: Array, v: Array) -> tuple[Array, Array, Array]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import hashlib
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -247,7 +247,9 @@ def _joints(elements: Sequence[Element], eligible: NDArray[np.bool_], limits: Li
     numbered: list[tuple[str, Draft]] = []
     for pair in sorted(by_pair):
         name = f"{elements[pair[0]].guid} {elements[pair[1]].guid}"
-        numbered.extend((f"{name} {k}", draft) for k, draft in enumerate(sorted(by_pair[pair], key=_place)))
+        group = by_pair[pair]
+        ordered = sorted(group, key=_place) if len(group) > 1 else group
+        numbered.extend((f"{name} {k}", draft) for k, draft in enumerate(ordered))
     ids = _ids([name for name, _ in numbered])
     joints = [_joint(i, draft, elements) for i, (_, draft) in zip(ids, numbered, strict=True)]
     return tuple(sorted(joints, key=lambda joint: _RANK[joint.state]))
@@ -265,22 +267,22 @@ def _place(draft: Draft) -> tuple[float, ...]:
 
 def _ids(names: Sequence[str]) -> list[str]:
     """Short ids that follow from the names alone; two names that would share one get longer ones."""
-    codes = [_code(name) for name in names]
     length = _ID_LENGTH
-    out = [code[:length] for code in codes]
-    while len(set(out)) < len(out):
+    out = [_code(name, length) for name in names]
+    while len(set(out)) < len(out) and length < _MOST_DIGITS:
         length += 1
-        counts: dict[str, int] = defaultdict(int)
-        for short in out:
-            counts[short] += 1
-        out = [code[:length] if counts[short] > 1 else short for code, short in zip(codes, out, strict=True)]
+        counts = Counter(out)
+        out = [
+            _code(name, length) if counts[short] > 1 else short
+            for name, short in zip(names, out, strict=True)
+        ]
     return out
 
 
-def _code(name: str) -> str:
+def _code(name: str, length: int) -> str:
     number = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big")
     digits = []
-    for _ in range(_MOST_DIGITS):
+    for _ in range(length):
         number, digit = divmod(number, len(_DIGITS))
         digits.append(_DIGITS[digit])
     return "".join(digits)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bimfit.bim.faces import Faces, Index, components, ranges
+from bimfit.bim.faces import Faces, Index, components, dot, greatest, least, overlapping, ranges
 from bimfit.geometry.pose import Array
 
 _TOUCH = 2e-4
@@ -127,11 +127,11 @@ def _clip_pairs(faces: Faces, frames: PairFrames, rows: Index, least_gap: float,
     size_b = np.diff(faces.splits)[b]
     pair = np.repeat(rows, size_b)
     tri_b = faces.members[ranges(faces.splits[b], size_b)]
-    corners = faces.triangles[tri_b]
     reach = max(max_gap, -least_gap) + 2e-3
     fa = frames.a[pair]
-    near = np.all(corners.min(axis=1) <= faces.high[fa] + reach, axis=1)
-    near &= np.all(corners.max(axis=1) >= faces.low[fa] - reach, axis=1)
+    near = overlapping(
+        faces.low[fa] - reach, faces.high[fa] + reach, faces.triangle_low[tri_b], faces.triangle_high[tri_b]
+    )
     pair, tri_b = pair[near], tri_b[near]
     fa = frames.a[pair]
     size_a = np.diff(faces.splits)[fa]
@@ -139,7 +139,7 @@ def _clip_pairs(faces: Faces, frames: PairFrames, rows: Index, least_gap: float,
     tri_a = faces.members[ranges(faces.splits[fa], size_a)]
     pair, tri_b = pair[which], tri_b[which]
     ta, tb = _flat(faces, frames, pair, tri_a), _flat(faces, frames, pair, tri_b)
-    near = np.all(ta.min(axis=1) < tb.max(axis=1), axis=1) & np.all(tb.min(axis=1) < ta.max(axis=1), axis=1)
+    near = overlapping(least(ta), greatest(ta), least(tb), greatest(tb))
     pair, ta, tb = pair[near], ta[near], tb[near]
     poly, count = tb, np.full(len(tb), 3)
     for k in range(3):
@@ -162,10 +162,11 @@ def _clip_pairs(faces: Faces, frames: PairFrames, rows: Index, least_gap: float,
 def _flat(faces: Faces, frames: PairFrames, pair: Index, triangles: Index) -> Array:
     """Triangles in the mid-planes of their pairs, counter-clockwise, shape (n, 3, 2)."""
     corners = faces.triangles[triangles]
-    x = np.einsum("nij,nj->ni", corners, frames.e1[pair])
-    y = np.einsum("nij,nj->ni", corners, frames.e2[pair])
-    flat = np.stack([x, y], axis=2)
-    turned = polygon_area(flat, signed=True) < 0.0
+    flat = np.empty((len(pair), 3, 2))
+    flat[..., 0] = dot(corners, frames.e1[pair][:, None])
+    flat[..., 1] = dot(corners, frames.e2[pair][:, None])
+    p, q = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
+    turned = p[:, 0] * q[:, 1] < p[:, 1] * q[:, 0]
     flat[turned] = flat[turned][:, ::-1]
     return flat
 
@@ -184,30 +185,55 @@ def _clip(poly: Array, count: Index, side: Array) -> tuple[Array, Index, NDArray
     Sutherland and Hodgman's step for all of them at once. Returns polygons with one more column, their
     counts and which have any area left.
     """
+    valid = np.arange(poly.shape[1]) < count[:, None]
+    inside = (side >= 0.0) & valid
+    number = inside.sum(axis=1)
+    keep = number > 0
+    crossed = np.flatnonzero(keep & (number < count))
+    total = count.copy()
+    out = poly
+    if len(crossed):
+        some, total[crossed] = _cut(
+            poly[crossed], count[crossed], side[crossed], inside[crossed], valid[crossed]
+        )
+        wider = max(0, some.shape[1] - poly.shape[1])
+        out = np.concatenate([poly, np.repeat(poly[:, -1:], wider, axis=1)], axis=1)
+        out[crossed, : some.shape[1]] = some
+        out[crossed, some.shape[1] :] = some[:, -1:]
+    keep &= total >= 3
+    return out, total, keep
+
+
+def _cut(
+    poly: Array,
+    count: Index,
+    side: Array,
+    inside: NDArray[np.bool_],
+    valid: NDArray[np.bool_],
+) -> tuple[Array, Index]:
+    """The clipping step for polygons that the line crosses."""
     n, k, _ = poly.shape
-    if not n:
-        return np.zeros((0, k + 1, 2)), count, np.zeros(0, bool)
     column = np.arange(k)
-    valid = column < count[:, None]
     onward = np.where(column + 1 < count[:, None], column + 1, 0)
     row = np.arange(n)[:, None]
+    crossing = valid & (inside != inside[row, onward])
     next_side = side[row, onward]
-    inside = (side >= 0.0) & valid
-    crossing = valid & ((side >= 0.0) != (next_side >= 0.0))
     with np.errstate(divide="ignore", invalid="ignore"):
         t = np.where(crossing, side / (side - next_side), 0.0)
     cut = poly + t[..., None] * (poly[row, onward] - poly)
-    emit = np.stack([inside, crossing], axis=2).reshape(n, 2 * k)
-    points = np.stack([poly, cut], axis=2).reshape(n, 2 * k, 2)
+    emit = np.empty((n, 2 * k), bool)
+    emit[:, ::2], emit[:, 1::2] = inside, crossing
+    points = np.empty((n, 2 * k, 2))
+    points[:, ::2], points[:, 1::2] = poly, cut
     total = emit.sum(axis=1)
     slot = np.cumsum(emit, axis=1) - 1
-    width = max(int(total.max(initial=0)), 1)
+    width = int(total.max())
     out = np.zeros((n, width, 2))
     r, c = np.nonzero(emit)
     out[r, slot[r, c]] = points[r, c]
     # repeat the last corner, so that areas and extents may ignore the count
     last = np.minimum(np.arange(width)[None, :], np.maximum(total - 1, 0)[:, None])
-    return out[row, last], total, total >= 3
+    return out[row, last], total
 
 
 def strip_labels(pieces: Pieces) -> Index:
@@ -219,8 +245,8 @@ def strip_labels(pieces: Pieces) -> Index:
     after = np.repeat(sizes, sizes) - position - 1
     i = np.repeat(np.arange(n), after)
     j = ranges(np.arange(n) + 1, after)
-    low, high = pieces.corners.min(axis=1), pieces.corners.max(axis=1)
-    near = np.all(low[i] <= high[j] + _TOUCH, axis=1) & np.all(low[j] <= high[i] + _TOUCH, axis=1)
+    low, high = least(pieces.corners), greatest(pieces.corners) + _TOUCH
+    near = overlapping(low[i], high[i], low[j], high[j])
     i, j = i[near], j[near]
     close = ~(_separated(pieces, i, j) | _separated(pieces, j, i))
     return components(n, i[close], j[close])
@@ -235,8 +261,11 @@ def _separated(pieces: Pieces, i: Index, j: Index) -> NDArray[np.bool_]:
     for c in range(k):
         onward = np.where(c + 1 < pieces.count[i], c + 1, 0)
         edge = p[np.arange(len(i)), onward] - p[:, c]
-        size = np.linalg.norm(edge, axis=1)
-        outward = np.stack([edge[:, 1], -edge[:, 0]], axis=1) * (turn / np.maximum(size, 1e-12))[:, None]
-        beyond = np.einsum("nkj,nj->nk", q - p[:, c : c + 1], outward).min(axis=1)
+        size = np.hypot(edge[:, 0], edge[:, 1])
+        scale = turn / np.maximum(size, 1e-12)
+        nx, ny = edge[:, 1] * scale, -edge[:, 0] * scale
+        beyond = least(q[..., 0] * nx[:, None] + q[..., 1] * ny[:, None]) - (
+            p[:, c, 0] * nx + p[:, c, 1] * ny
+        )
         out |= (beyond > _TOUCH) & (size > 1e-6) & (c < pieces.count[i])
     return out

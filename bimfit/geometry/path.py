@@ -48,14 +48,15 @@ class JointPath:
         if k < 2 or self.points.shape != (k, 3) or self.u.shape != (k - 1, 3) or self.v.shape != (k - 1, 3):
             raise ValueError("a path takes k points (k, 3) and k - 1 axes u and v (k - 1, 3)")
         way = self.points[1:] - self.points[:-1]
-        if not np.isfinite(self.points).all() or ((way * way).sum(axis=1) < 1e-18).any():
+        squared = np.einsum("ij,ij->i", way, way)
+        if not ((squared >= 1e-18) & (squared < np.inf)).all():
             raise ValueError("a path's points must be finite and apart from one another")
         if self.closed and np.linalg.norm(self.points[0] - self.points[-1]) > 1e-9:
             raise ValueError("a closed path must end where it starts")
         # written out: np.cross costs more than all the rest of this
         u, v = self.u[:, [1, 2, 0]], self.v[:, [2, 0, 1]]
         along = u * v - self.u[:, [2, 0, 1]] * self.v[:, [1, 2, 0]]
-        if ((along * way).sum(axis=1) <= 0.0).any():
+        if not (np.einsum("ij,ij->i", along, way) > 0.0).all():
             raise ValueError("u x v must point along the path")
 
     @classmethod
