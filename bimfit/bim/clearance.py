@@ -16,6 +16,7 @@ from bimfit.geometry.pose import Array
 TOUCH = 1e-3
 CLASH = -1.5e-3
 _SAMPLES = 15
+_TO_RIM = 2.0 / 3.0
 _CLEAR_SHARE = 0.8
 _INSIDE = 1e-4
 _OWN = 3e-4
@@ -72,7 +73,7 @@ def judge(faces: Faces, frames: PairFrames, strips: Strips) -> Clearance:
         keys = strip[other[0, rows]] * np.int64(len(faces.starts)) + other[1, rows]
         unique, inverse = np.unique(keys, return_inverse=True)
         votes = np.bincount(inverse, weight[other[0, rows]])
-        order = np.argsort(votes, kind="stable")
+        order = np.argsort(np.round(votes, 9), kind="stable")
         filler[unique[order] // len(faces.starts)] = unique[order] % len(faces.starts)
     return Clearance(state, filler)
 
@@ -83,14 +84,16 @@ def _samples(strips: Strips, tested: Index) -> tuple[Index, Array, Array]:
     pieces = chosen.pieces
     strip = np.repeat(tested, np.diff(chosen.splits))
     middle = piece_centroids(pieces)
-    halfway = 0.5 * (middle[:, None] + pieces.corners)
-    points = np.concatenate([middle[:, None], halfway], axis=1)
-    real = np.concatenate(
-        [np.ones((len(strip), 1), bool), np.arange(pieces.corners.shape[1]) < pieces.count[:, None]], axis=1
-    )
-    row, column = np.nonzero(real)
+    # of a rectangle: the centres of nine equal cells
+    column = np.arange(pieces.corners.shape[1])
+    real = column < pieces.count[:, None]
+    onward = np.where(column + 1 < pieces.count[:, None], column + 1, 0)
+    onward = pieces.corners[np.arange(len(strip))[:, None], onward]
+    rim = np.concatenate([pieces.corners, 0.5 * (pieces.corners + onward)], axis=1)
+    points = np.concatenate([middle[:, None], middle[:, None] + _TO_RIM * (rim - middle[:, None])], axis=1)
+    row, column = np.nonzero(np.concatenate([np.ones((len(strip), 1), bool), real, real], axis=1))
     owner = strip[row]
-    share = pieces.area[row] / (pieces.count[row] + 1)
+    share = pieces.area[row] / (2 * pieces.count[row] + 1)
     heads = np.flatnonzero(np.diff(owner, prepend=-1))
     sizes = np.diff(np.append(heads, len(owner)))
     rank = np.arange(len(owner)) - np.repeat(heads, sizes)
@@ -111,6 +114,10 @@ def _hits(
     low, high = np.minimum.reduceat(low_s, heads), np.maximum.reduceat(high_s, heads)
     sizes = np.diff(np.append(heads, len(strip)))
     group, triangle = nearby_triangles(faces, low, high)
+    # the two faces themselves lie at the ends of the way
+    face, lead = faces.face_of[triangle], pair[heads[group]]
+    other = np.flatnonzero((face < 0) | ((face != frames.a[lead]) & (face != frames.b[lead])))
+    group, triangle = group[other], triangle[other]
     found: list[tuple[Index, Index, NDArray[np.bool_]]] = []
     costs = np.cumsum(sizes[group])
     position = 0

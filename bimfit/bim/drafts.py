@@ -28,6 +28,7 @@ _GROOVE_FACE = 0.1
 _GROOVE_ROOT = 0.02
 _FULL = 0.9
 _BAND_DEPTH = 0.5
+_ROUNDING = 1e-9
 _MID = 0.4871  # off the middle, where meshes tend to have vertices
 _SHARES = np.array([1.0 / 6.0, _MID, 5.0 / 6.0])
 
@@ -80,7 +81,9 @@ def find_drafts(meshes: Sequence[TriangleMesh], eligible: NDArray[np.bool_], lim
         _add_grooves(faces, eligible, limits, groups)
     rows = [(key, leg) for key in sorted(groups) for leg in merge(groups[key])]
     rows = [
-        (key, leg) for key, leg in rows if leg.length >= limits.min_length and leg.depth >= limits.min_depth
+        (key, leg)
+        for key, leg in rows
+        if leg.length >= limits.min_length - _ROUNDING and leg.depth >= limits.min_depth - _ROUNDING
     ]
     drafts = _finish(faces, rows) if rows else []
     return [draft for draft in drafts if not draft.leg.groove or draft.kind in ("v-groove", "bevel")]

@@ -34,8 +34,12 @@ class Faces:
         Where each element's triangles start in ``triangles``.
     element, normal, offset, low, high, area
         Of each face: element, outward unit normal, plane offset (n . p), bounding box, m^2.
-    members, splits : ndarray
-        Triangles of face i are ``members[splits[i]:splits[i + 1]]``.
+    plates, corners : ndarray, shapes (p, 4, 3) and (p,)
+        Convex pieces of the faces, of 3 or 4 corners; of three, the last is repeated.
+    splits : ndarray
+        Plates of face i are ``splits[i]:splits[i + 1]``.
+    face_of : ndarray, shape (m,)
+        Face of each triangle, or -1.
     """
 
     origin: Array
@@ -48,8 +52,20 @@ class Faces:
     low: Array
     high: Array
     area: Array
-    members: Index
+    plates: Array
+    corners: Index
     splits: Index
+    face_of: Index
+
+    @cached_property
+    def plate_low(self) -> Array:
+        """Least corners of the plates, shape (p, 3)."""
+        return least(self.plates)
+
+    @cached_property
+    def plate_high(self) -> Array:
+        """Greatest corners of the plates, shape (p, 3)."""
+        return greatest(self.plates)
 
     @cached_property
     def triangle_low(self) -> Array:
@@ -100,7 +116,10 @@ def find_faces(meshes: Sequence[TriangleMesh], *, min_area: float, min_diagonal:
     unit = summed / np.linalg.norm(summed, axis=1, keepdims=True)
     weighted = np.add.reduceat(corners.mean(axis=1) * area[members, None], heads)[keep] / total[keep, None]
     sizes = np.diff(splits)[keep]
-    kept = ranges(splits[:-1][keep], sizes)
+    kept = members[ranges(splits[:-1][keep], sizes)]
+    face_of = np.full(len(triangles), -1, np.int64)
+    face_of[kept] = np.repeat(np.arange(len(sizes)), sizes)
+    plates, corner_count, plate_counts = _plates(triangles[kept], sizes, unit)
     return Faces(
         origin=origin,
         triangles=triangles,
@@ -112,9 +131,40 @@ def find_faces(meshes: Sequence[TriangleMesh], *, min_area: float, min_diagonal:
         low=low[keep],
         high=high[keep],
         area=total[keep],
-        members=members[kept],
-        splits=np.concatenate([[0], np.cumsum(sizes)]),
+        plates=plates,
+        corners=corner_count,
+        splits=np.concatenate([[0], np.cumsum(plate_counts)]),
+        face_of=face_of,
     )
+
+
+def _plates(triangles: Array, sizes: Index, normal: Array) -> tuple[Array, Index, Index]:
+    """Triangles (m, 3, 3) of faces of those sizes as plates: pairs that make a convex face become one.
+
+    Returns the plates, their corner counts and how many each face has.
+    """
+    heads = np.cumsum(sizes) - sizes
+    plates = np.concatenate([triangles, triangles[:, 2:]], axis=1)
+    corners = np.full(len(triangles), 3)
+    pairs = np.flatnonzero(sizes == 2)
+    one, two = triangles[heads[pairs]], triangles[heads[pairs] + 1]
+    same = (one[:, :, None] == two[:, None]).all(axis=3)
+    shared_one, shared_two = same.any(axis=2), same.any(axis=1)
+    good = np.flatnonzero((shared_one.sum(axis=1) == 2) & (shared_two.sum(axis=1) == 2))
+    lone, far = np.argmin(shared_one[good], axis=1), np.argmin(shared_two[good], axis=1)
+    turned = [one[good, (lone + step) % 3] for step in range(3)]
+    quad = np.stack([turned[0], turned[1], two[good, far], turned[2]], axis=1)
+    edge = np.roll(quad, -1, axis=1) - quad
+    bend = dot(cross(edge, np.roll(edge, -1, axis=1)), normal[pairs[good], None])
+    convex = good[np.all(bend >= 0.0, axis=1) | np.all(bend <= 0.0, axis=1)]
+    head = heads[pairs[convex]]
+    plates[head] = quad[np.isin(good, convex)]
+    corners[head] = 4
+    kept = np.ones(len(triangles), bool)
+    kept[head + 1] = False
+    counts = sizes.copy()
+    counts[pairs[convex]] = 1
+    return plates[kept], corners[kept], counts
 
 
 def least(values: Array) -> Array:

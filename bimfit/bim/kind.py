@@ -279,30 +279,25 @@ def free_sides(
     ignored : ndarray, shape (k,)
         An element that does not count, such as the filler; -1 for none.
     """
-    narrow = np.flatnonzero(gap <= 2.0 * _BESIDE)
-    out = _free(faces, origin, v, depth, ignored, np.zeros(len(gap)))
-    if len(narrow):
-        o, w, start = origin[narrow], _BESIDE * u[narrow], 0.5 * depth[narrow] + _BESIDE
-        rest = (v[narrow], depth[narrow], ignored[narrow], start)
-        out[narrow] = _free(faces, o + w, *rest) | _free(faces, o - w, *rest)
-    return out
-
-
-def _free(faces: Faces, origin: Array, v: Array, depth: Array, ignored: Index, clear: Array) -> Sides:
-    """As :func:`free_sides`, without regard to what is met before ``clear`` (k,)."""
     k, count, _ = origin.shape
-    start = origin.reshape(-1, 3)
-    way = v.reshape(-1, 3)
-    reach = np.repeat(0.5 * depth + _REACH, count)
-    near = np.repeat(clear, count)
-    half = np.abs(way) * reach[:, None] + 1e-6
+    way, reach = v.reshape(-1, 3), np.repeat(0.5 * depth + _REACH, count)
+    start, beside = origin.reshape(-1, 3), _BESIDE * u.reshape(-1, 3)
+    half = np.abs(way) * reach[:, None] + np.abs(beside)
     row, triangle = nearby_triangles(faces, start - half, start + half)
-    joint = row // count
-    kept = faces.owner[triangle] != ignored[joint]
+    kept = faces.owner[triangle] != ignored[row // count]
     row, triangle = row[kept], triangle[kept]
-    distance = ray_distance(start[row], way[row], faces.triangles[triangle])
-    shut = np.zeros((k * count, 2), bool)
-    for s, sign in ((0, 1.0), (1, -1.0)):
-        hit = (sign * distance > 1e-6 + near[row]) & (sign * distance <= reach[row])
-        shut[row[hit], s] = True
-    return np.asarray(shut.reshape(k, count, 2).sum(axis=1) * 2 <= count)
+    tight = gap <= 2.0 * _BESIDE
+    out = np.zeros((k, 2), bool)
+    clear = np.repeat(0.5 * depth + _BESIDE, count)
+    for chosen, shift, first in ((~tight, 0.0, None), (tight, 1.0, clear), (tight, -1.0, clear)):
+        some = chosen[row // count]
+        r, t = row[some], triangle[some]
+        distance = ray_distance(start[r] + shift * beside[r], way[r], faces.triangles[t])
+        least = 1e-6 if first is None else first[r]
+        shut = np.zeros((k * count, 2), bool)
+        for side, sign in ((0, 1.0), (1, -1.0)):
+            hit = (sign * distance > least) & (sign * distance <= reach[r])
+            shut[r[hit], side] = True
+        free = shut.reshape(k, count, 2).sum(axis=1) * 2 <= count
+        out[chosen] |= free[chosen]
+    return out

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -46,12 +47,15 @@ class RawModel:
     failed : dict
         Step id -> why there is no mesh.
     notes : list of str
+    seconds : float
+        From the first to the last mesh: the tessellation without starting, parsing and describing.
     """
 
     index: dict[str, Any] = field(default_factory=dict)
     meshes: dict[int, TriangleMesh] = field(default_factory=dict)
     failed: dict[int, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    seconds: float = 0.0
 
 
 def tessellate(source: Source, include: Sequence[str] | None, time_limit: float) -> RawModel:
@@ -111,6 +115,7 @@ def _run(
         "threads": min(os.cpu_count() or 1, 8),
         "memory": _memory(),
     }
+    begun = time.perf_counter()
     opening = max(_OPENING, time_limit) + len(source.data) * _OPENING_RATE
     current: int | None = None
     with _child(request) as messages:
@@ -128,10 +133,12 @@ def _run(
             if kind == "error":
                 raise ModelError(f"could not be read: {_plain(head['message'])}", file=source.path)
             if kind == "end":
+                raw.seconds += time.perf_counter() - begun
                 return None, "end"
             if kind == "index":
                 raw.index = head
             elif kind == "begin":
+                begun = time.perf_counter()
                 began, patience = True, time_limit + _ITEM_RATE * head["count"] * (not one_by_one)
             elif kind == "start":
                 current = head["id"]

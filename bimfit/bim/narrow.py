@@ -89,7 +89,7 @@ def pair_frames(faces: Faces, a: Index, b: Index) -> PairFrames:
 
 
 def facing_pieces(faces: Faces, frames: PairFrames, *, least_gap: float, max_gap: float) -> Pieces:
-    """Clip each triangle of A against each of B in their mid-plane, and by the gap between them."""
+    """Clip each plate of A against each of B in their mid-plane, and by the gap between them."""
     sizes = np.diff(faces.splits)[frames.b]
     chunks: list[Pieces] = []
     ends = np.cumsum(sizes * np.maximum(1, np.diff(faces.splits)[frames.a]))
@@ -124,32 +124,31 @@ def _chunks(ends: Index, most: int) -> list[tuple[int, int]]:
 
 def _clip_pairs(faces: Faces, frames: PairFrames, rows: Index, least_gap: float, max_gap: float) -> Pieces:
     b = frames.b[rows]
-    size_b = np.diff(faces.splits)[b]
-    pair = np.repeat(rows, size_b)
-    tri_b = faces.members[ranges(faces.splits[b], size_b)]
+    sizes = np.diff(faces.splits)
+    pair = np.repeat(rows, sizes[b])
+    of_b = ranges(faces.splits[b], sizes[b])
     reach = max(max_gap, -least_gap) + 2e-3
     fa = frames.a[pair]
     near = overlapping(
-        faces.low[fa] - reach, faces.high[fa] + reach, faces.triangle_low[tri_b], faces.triangle_high[tri_b]
+        faces.low[fa] - reach, faces.high[fa] + reach, faces.plate_low[of_b], faces.plate_high[of_b]
     )
-    pair, tri_b = pair[near], tri_b[near]
+    pair, of_b = pair[near], of_b[near]
     fa = frames.a[pair]
-    size_a = np.diff(faces.splits)[fa]
-    which = np.repeat(np.arange(len(pair)), size_a)
-    tri_a = faces.members[ranges(faces.splits[fa], size_a)]
-    pair, tri_b = pair[which], tri_b[which]
-    ta, tb = _flat(faces, frames, pair, tri_a), _flat(faces, frames, pair, tri_b)
-    near = overlapping(least(ta), greatest(ta), least(tb), greatest(tb))
-    pair, ta, tb = pair[near], ta[near], tb[near]
-    poly, count = tb, np.full(len(tb), 3)
-    for k in range(3):
-        p, q = ta[:, k], ta[:, (k + 1) % 3]
-        edge = q - p
+    which = np.repeat(np.arange(len(pair)), sizes[fa])
+    of_a = ranges(faces.splits[fa], sizes[fa])
+    pair, of_b = pair[which], of_b[which]
+    clip, poly = _flat(faces, frames, pair, of_a), _flat(faces, frames, pair, of_b)
+    near = overlapping(least(clip), greatest(clip), least(poly), greatest(poly))
+    pair, clip, poly, count = pair[near], clip[near], poly[near], faces.corners[of_b[near]]
+    turn = np.sign(polygon_area(clip, signed=True))
+    for k in range(4):
+        p, q = clip[:, k], clip[:, (k + 1) % 4]
+        edge = (q - p) * turn[:, None]
         side = edge[:, None, 0] * (poly[..., 1] - p[:, None, 1]) - edge[:, None, 1] * (
             poly[..., 0] - p[:, None, 0]
         )
         poly, count, keep = _clip(poly, count, side)
-        poly, count, pair, ta = poly[keep], count[keep], pair[keep], ta[keep]
+        poly, count, pair, clip, turn = poly[keep], count[keep], pair[keep], clip[keep], turn[keep]
     for sign, limit in ((1.0, least_gap), (-1.0, max_gap)):
         low, high = frames.heights(pair, poly)
         poly, count, keep = _clip(poly, count, sign * (high - low - limit))
@@ -159,15 +158,12 @@ def _clip_pairs(faces: Faces, frames: PairFrames, rows: Index, least_gap: float,
     return Pieces(pair[keep], poly[keep], count[keep], area[keep])
 
 
-def _flat(faces: Faces, frames: PairFrames, pair: Index, triangles: Index) -> Array:
-    """Triangles in the mid-planes of their pairs, counter-clockwise, shape (n, 3, 2)."""
-    corners = faces.triangles[triangles]
-    flat = np.empty((len(pair), 3, 2))
+def _flat(faces: Faces, frames: PairFrames, pair: Index, plates: Index) -> Array:
+    """Plates in the mid-planes of their pairs, shape (n, 4, 2)."""
+    corners = faces.plates[plates]
+    flat = np.empty((len(pair), 4, 2))
     flat[..., 0] = dot(corners, frames.e1[pair][:, None])
     flat[..., 1] = dot(corners, frames.e2[pair][:, None])
-    p, q = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
-    turned = p[:, 0] * q[:, 1] < p[:, 1] * q[:, 0]
-    flat[turned] = flat[turned][:, ::-1]
     return flat
 
 

@@ -12,6 +12,7 @@ from bimfit.geometry.pose import Array
 
 _ANGLE_BIN = np.radians(0.05)
 _SHORT_EDGE = 2e-3
+_SQUARE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -149,7 +150,7 @@ def _least_rectangles(pieces: Pieces, splits: Index) -> tuple[Array, Array, Arra
     c, s = np.cos(angle[best]), np.sin(angle[best])
     xm, ym = 0.5 * (x0 + x1)[best], 0.5 * (y0 + y1)[best]
     wide, tall = (x1 - x0)[best], (y1 - y0)[best]
-    along = wide >= tall
+    along = wide >= tall - _SQUARE  # of a square the same side, whatever rounding says
     axis = np.where(along[:, None], np.stack([c, s], axis=1), np.stack([-s, c], axis=1))
     centre = np.stack([xm * c - ym * s, xm * s + ym * c], axis=1)
     return axis, centre, np.maximum(wide, tall), np.minimum(wide, tall)

@@ -103,8 +103,9 @@ def try_case(number: int, folder: Path) -> Case:
     try:
         model = load_model(path, time_limit=ELEMENT_LIMIT, cache=False)
         found = find_joints(model)
-        finite = all(np.isfinite(element.mesh.vertices).all() for element in model.elements)
-        finite &= all(np.isfinite([joint.width, joint.length, joint.depth]).all() for joint in found)
+        finite = all(bool(np.isfinite(element.mesh.vertices).all()) for element in model.elements) and all(
+            bool(np.isfinite([joint.width, joint.length, joint.depth]).all()) for joint in found
+        )
         outcome = "model" if finite else "numbers that are not finite"
         line = f"{len(model.elements)} elements, {len(model.skipped)} left out, {len(found)} joints"
     except BimfitError as error:
@@ -303,9 +304,9 @@ def _text(cases: Sequence[Case]) -> str:
             lines.append(
                 f"{name:20} {len(some):6} {count['model']:7} {count['refused']:8} {bad:4} {slowest:10.1f}"
             )
-    bad = [case for case in cases if not case.good]
+    failed = [case for case in cases if not case.good]
     lines.append(
-        f"{len(cases)} files, {len(bad)} of which did not end as they must (within {FILE_LIMIT:g} s)"
+        f"{len(cases)} files, {len(failed)} of which did not end as they must (within {FILE_LIMIT:g} s)"
     )
-    lines += [f"  {case.number}: {case.mutation}: {case.outcome}: {case.line}" for case in bad]
+    lines += [f"  {case.number}: {case.mutation}: {case.outcome}: {case.line}" for case in failed]
     return "\n".join(lines)
