@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 from pathlib import Path
 from typing import Any
 
 from bimfit.bim.source import read_source
 from bimfit.errors import ModelError
+
+_PROJECT = re.compile(rb"=\s*IFCPROJECT\s*\(\s*'([0-9A-Za-z_$]{22})'", re.IGNORECASE)
+
+
+def project_guid(path: str | Path) -> str:
+    """GlobalId of a file's IfcProject; empty where the file or the project is not there."""
+    try:
+        found = _PROJECT.search(read_source(path).data)
+    except ModelError:
+        return ""
+    return found.group(1).decode("ascii") if found else ""
 
 
 def open_ifc(path: str | Path) -> Any:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import typer
 
 from bimfit.cli.choosing import choosing
+from bimfit.cli.limits import HELP as LIMITS_HELP
+from bimfit.cli.limits import read_limits
 from bimfit.cli.options import build_config, read_pose
 from bimfit.cli.progress import terminal_progress
 
@@ -52,19 +54,31 @@ def run(
     config: Path | None = typer.Option(None, "--config", metavar="FILE.toml", help="Settings."),
     pictures: bool = typer.Option(True, help="Draw pictures."),
     as_built: bool = typer.Option(True, help="Write the model with the gaps as as-built.ifc."),
+    limits: str | None = typer.Option(None, "--limits", metavar="LIMITS", help=LIMITS_HELP),
+    bcf: Path | None = typer.Option(
+        None, "--bcf", metavar="FILE", help="Write joints that break the limits or were not measured there."
+    ),
+    bcf_version: str = typer.Option("2.1", "--bcf-version", metavar="V", help="2.1 or 3.0."),
 ) -> int:
     """Fit the joints of a model to a scan and write the as-built gap."""
-    from bimfit.pipeline.as_built import try_write_model
-    from bimfit.pipeline.output import check_folder, describe, write_survey
-    from bimfit.pipeline.pictures import write_pictures
+    from bimfit.pipeline.deliver import Deliverables, check_deliverables, deliver
+    from bimfit.pipeline.limits import Limits
+    from bimfit.pipeline.output import check_folder, describe
     from bimfit.pipeline.survey import survey
 
     settings = build_config(
         config, window=window, tolerance=tolerance, spacing=spacing, thickness=thickness, sigma=sigma
     )
     pose = None if scan_pose is None else read_pose(scan_pose)
+    wanted = Deliverables(
+        pictures=pictures,
+        as_built=as_built,
+        limits=Limits() if limits is None else read_limits(limits),
+        bcf=bcf,
+        bcf_version=bcf_version,  # type: ignore[arg-type]  # checked below
+    )
     check_folder(output)
-    unwritten = ""
+    check_deliverables(wanted, model, scan)
     with terminal_progress() as progress:
         result = survey(
             model,
@@ -76,19 +90,11 @@ def run(
             scan_pose=pose,
             progress=progress,
         )
-        progress("writing", 0.0)
-        write_survey(result, output)
-        if as_built:
-            progress("writing the as-built model", 0.0)
-            unwritten = try_write_model(result, output)
-        if pictures:
-            write_pictures(result, output)
+        _, said = deliver(result, output, wanted, progress)
     for one in result.joints:
         print(describe(one))
     print(f"results in {output}")
-    if unwritten:
-        print(f"bimfit: note: no as-built.ifc: {unwritten}", file=sys.stderr)
-    for note in result.notes:
+    for note in (*said, *result.notes):
         print(f"bimfit: note: {note}", file=sys.stderr)
     for one in result.failed:
         print(f"bimfit: joint {one.joint.id} could not be estimated: {one.reason}", file=sys.stderr)

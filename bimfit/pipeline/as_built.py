@@ -25,13 +25,12 @@ def write_model(survey: SurveyResult, folder: Path) -> Path:
     return write_as_built(survey.model, [as_built_gap(joint) for joint in survey.joints], folder / NAME)
 
 
-def try_write_model(survey: SurveyResult, folder: Path) -> str:
+def try_write_model(survey: SurveyResult, folder: Path) -> tuple[Path | None, tuple[str, ...]]:
     """Write the as-built model, or say why that cannot be; the other results stand either way."""
     try:
-        write_model(survey, folder)
+        return write_model(survey, folder), ()
     except BimfitError as error:
-        return str(error)
-    return ""
+        return None, (f"no {NAME}: {error}",)
 
 
 def as_built_gap(result: JointResult) -> AsBuiltGap:

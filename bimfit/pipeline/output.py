@@ -16,6 +16,9 @@ from bimfit.pipeline.results import stations_to_csv, survey_to_dict, to_json
 if TYPE_CHECKING:
     from bimfit.gap.mesh import GapMesh
 
+DERIVED = ("as-built.ifc", "schedule.csv", "schedule.xlsx", "report.html")
+"""What a run writes into its folder after results.json, and makes from it."""
+PICTURES = ("scene", "gap-poses", "slice", "tables")
 MESH_FORMATS = ("glb", "stl", "ply", "obj", "3mf")
 
 
@@ -46,12 +49,11 @@ def write_survey(
     meshes = {j.joint.id: j.mesh for j in survey.joints if j.mesh is not None}
     planned = [folder / f"gap-{safe_name(i)}.{f}" for i in meshes for f in formats]
     planned += [folder / "results.json", folder / "stations.csv"]
-    protect_inputs([*planned, folder / "as-built.ifc"], (survey.model, survey.scan))
-    stale = _earlier_files(folder) - set(planned)
+    protect_inputs([*planned, *(folder / name for name in DERIVED)], (survey.model, survey.scan))
+    stale = _earlier_files(folder) - set(planned) - {survey.model.absolute(), survey.scan.absolute()}
     files = {i: _write_meshes(i, mesh, folder, formats) for i, mesh in meshes.items()}
     write_text(folder / "stations.csv", stations_to_csv(survey.joints))
     write_text(folder / "results.json", to_json(survey_to_dict(survey, files)))
-    protect_inputs(stale, (survey.model, survey.scan))
     for path in stale:
         path.unlink(missing_ok=True)
     return tuple(planned)
@@ -105,13 +107,19 @@ def _write_meshes(joint_id: str, mesh: GapMesh, folder: Path, formats: Sequence[
 
 
 def _earlier_files(folder: Path) -> set[Path]:
-    """Meshes that an earlier results.json in the folder names, and that therefore are ours to remove."""
+    """Files that belong to an earlier results.json in the folder, and that therefore are ours to remove."""
     try:
         earlier = json.loads((folder / "results.json").read_text(encoding="utf-8"))
         names = [name for joint in earlier["joints"] for name in (joint.get("meshes") or {}).values()]
+        ids = [safe_name(str(joint["id"])) for joint in earlier["joints"]]
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return set()
-    return {folder / name for name in names if Path(name).name == name and name.startswith("gap-")}
+    meshes = {folder / name for name in names if Path(name).name == name and name.startswith("gap-")}
+    return (
+        meshes
+        | {folder / name for name in DERIVED}
+        | {folder / f"{k}-{i}.png" for k in PICTURES for i in ids}
+    )
 
 
 def describe(joint: JointResult) -> str:

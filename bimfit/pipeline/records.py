@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from bimfit.estimation.noise import Noise
     from bimfit.gap.mesh import GapMesh
     from bimfit.gap.section import GapSection
+    from bimfit.gap.step import Step
     from bimfit.gap.volume import Volumes
     from bimfit.geometry.line_scan import LineScan
     from bimfit.registration.result import MatchResult
@@ -61,6 +62,16 @@ class StationResult:
     components: tuple[ComponentResult, ComponentResult]
     gap: GapSection | None
     seconds: float = 0.0
+
+    @property
+    def step(self) -> Step | None:
+        """How flush the two components are at the mouth; None where that is not known."""
+        from bimfit.gap.step import gap_step
+
+        a, b = self.components
+        if a.pose is None or b.pose is None:
+            return None
+        return gap_step(self.section.gap, a.pose, b.pose, a.covariance, b.covariance)
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bimfit import __version__
+from bimfit.gap.section import gap_section
+from bimfit.geometry.pose import Pose2D
 from bimfit.pipeline.records import ComponentResult, JointResult, StationResult, SurveyResult
 
 if TYPE_CHECKING:
+    from bimfit.bim.model import Model
     from bimfit.gap.section import GapSection
     from bimfit.geometry.frame import SectionFrame
     from bimfit.registration.result import MatchResult
@@ -38,14 +41,20 @@ def survey_to_dict(survey: SurveyResult, meshes: Mapping[str, Mapping[str, Any]]
         "scan": str(survey.scan),
         "units": {"length": "m", "angle": "rad"},
         "notes": list(survey.notes),
-        "joints": [_joint(joint, meshes.get(joint.joint.id, {})) for joint in survey.joints],
+        "joints": [_joint(joint, survey.building, meshes.get(joint.joint.id, {})) for joint in survey.joints],
     }
 
 
-def _joint(result: JointResult, files: Mapping[str, Any]) -> dict[str, Any]:
+def _joint(result: JointResult, building: Model, files: Mapping[str, Any]) -> dict[str, Any]:
     volumes = result.volumes
+    elements = [building.element(guid) for guid in result.joint.elements]
+    path = result.joint.path
     return {
         **result.joint.to_dict(),
+        "names": [element.name for element in elements],
+        "classes": [element.ifc_class for element in elements],
+        "storeys": [element.storey for element in elements],
+        "path": {"points": path.points, "u": path.u, "v": path.v, "closed": path.closed},
         "method": result.method,
         "motion": result.motion,
         "noise": None
@@ -79,7 +88,7 @@ def _station(station: StationResult) -> dict[str, Any]:
         "points": len(station.slice.points),
         "combined": None if station.combined is None else _search(station.combined, frame),
         "components": [_component(component, frame) for component in station.components],
-        "gap": None if station.gap is None else _gap(station.gap),
+        "gap": None if station.gap is None else _gap(station, station.gap),
         "seconds": station.seconds,
     }
 
@@ -113,18 +122,41 @@ def _search(match: MatchResult, frame: SectionFrame) -> dict[str, Any]:
     }
 
 
-def _gap(gap: GapSection) -> dict[str, Any]:
-    sigma = gap.sigma
+def _gap(station: StationResult, gap: GapSection) -> dict[str, Any]:
+    sigma, step = gap.sigma, station.step
     return {
         "origin": gap.origin_world,
         "angle": gap.angle,
         "width": {"mouth": gap.width_mouth, "root": gap.width_root, "narrowest": gap.width_narrowest},
         "area": gap.area,
         "overlap": gap.overlap_area,
+        "contact": gap.contact,
+        "step": None if step is None else step.value,
+        "designed": _designed(station),
         "polygon": gap.polygon_world,
         "sigma": None
         if sigma is None
-        else {name: getattr(sigma, name) for name in ("x", "y", "angle", "width", "area")},
+        else {
+            **{name: getattr(sigma, name) for name in ("x", "y", "angle", "width", "area")},
+            "root": sigma.width_root,
+            "narrowest": sigma.width_narrowest,
+            "step": None if step is None else step.sigma,
+        },
+    }
+
+
+def _designed(station: StationResult) -> dict[str, Any]:
+    """The same gap as designed, measured in the same way."""
+    section = station.section
+    design = gap_section(section.s, section.frame, section.gap, Pose2D(), Pose2D())
+    return {
+        "width": {
+            "mouth": design.width_mouth,
+            "root": design.width_root,
+            "narrowest": design.width_narrowest,
+        },
+        "area": design.area,
+        "step": None if station.step is None else station.step.designed,
     }
 
 
@@ -177,6 +209,13 @@ COLUMNS = [
     "b_theta_rad",
     "search_stop",
     "evaluations",
+    "contact",
+    "designed_width_mouth_m",
+    "step_m",
+    "designed_step_m",
+    "sigma_width_root_m",
+    "sigma_width_narrowest_m",
+    "sigma_step_m",
 ]
 
 
@@ -227,4 +266,11 @@ def _row(joint: JointResult, station: StationResult) -> dict[str, Any]:
         if gap.sigma is not None:
             for name, unit in (("x", "m"), ("y", "m"), ("width", "m"), ("angle", "rad"), ("area", "m2")):
                 row[f"sigma_{name}_{unit}"] = float(getattr(gap.sigma, name))
+            for name in ("width_root", "width_narrowest"):
+                row[f"sigma_{name}_m"] = float(getattr(gap.sigma, name))
+        designed = _designed(station)
+        row |= {"contact": gap.contact, "designed_width_mouth_m": float(designed["width"]["mouth"])}
+        step = station.step
+        if step is not None:
+            row |= {"step_m": step.value, "designed_step_m": step.designed, "sigma_step_m": step.sigma}
     return row
