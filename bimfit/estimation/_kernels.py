@@ -151,6 +151,139 @@ def sort_beams(
 
 
 @jit
+def median_step(d: Array) -> float:
+    """Median angle between neighbouring beams that differ at all, rad; 0 for none."""
+    n = d.shape[1]
+    step = np.empty(max(n - 1, 1))
+    count = 0
+    for k in range(n - 1):
+        x = abs(d[0, k + 1] * d[1, k] - d[1, k + 1] * d[0, k])
+        if x > 1e-7:
+            step[count] = x
+            count += 1
+    return float(np.median(step[:count])) if count else 0.0
+
+
+@jit
+def cover_cost(r: Array, miss: float, past: float, same: float, off: Array, deep: Array) -> None:
+    """What covering each beam costs: ``miss`` where it returned nothing, ``past`` where it went past.
+
+    Only a return that a neighbour bears out, within ``same``, may have come from behind.
+    """
+    n = r.shape[0]
+    for k in range(n):
+        off[k] = miss if r[k] < 0.0 else 0.0
+        deep[k] = 0.0
+        if r[k] > 0.0:
+            before = k > 0 and r[k - 1] > 0.0 and abs(r[k] - r[k - 1]) < same
+            after = k + 1 < n and r[k + 1] > 0.0 and abs(r[k + 1] - r[k]) < same
+            if before or after:
+                deep[k] = past
+
+
+@jit
+def scene(
+    edges_a: Array, edges_b: Array, pose_a: Array, pose_b: Array, p: Array, d: Array, start: Ints, eye: Array,
+    rho: Array, face: Ints,
+) -> None:  # fmt: skip
+    """Ranges (2, n) to A and to B at a pose each, and the edges met."""
+    rho[:] = np.inf
+    face[:] = -1
+    predict(
+        edges_a, math.cos(pose_a[2]), math.sin(pose_a[2]), pose_a[0], pose_a[1], p, d, start, eye, rho[0],
+        face[0],
+    )  # fmt: skip
+    predict(
+        edges_b, math.cos(pose_b[2]), math.sin(pose_b[2]), pose_b[0], pose_b[1], p, d, start, eye, rho[1],
+        face[1],
+    )  # fmt: skip
+
+
+@jit
+def _owner(a: float, b: float) -> int:
+    """0 for A, 1 for B, -1 where a beam meets neither."""
+    if a == np.inf and b == np.inf:
+        return -1
+    return 0 if a <= b else 1
+
+
+@jit
+def split_side(rho: Array, p: Array, start: Ints, eye: Array, cx: float, cy: float, side: Ints) -> None:
+    """Give every beam to the component on whose side of the cut it passes; see ownership.split_side."""
+    for g in range(eye.shape[0]):
+        s, t = start[g], start[g + 1]
+        ox, oy, lx, ly = eye[g, 0], eye[g, 1], eye[g, 2], eye[g, 3]
+        cut = pseudo_angle(lx * (cx - ox) + ly * (cy - oy), lx * (cy - oy) - ly * (cx - ox))
+        a = b = above_a = below_b = 0
+        for k in range(s, t):
+            side[k] = -1
+            own = _owner(rho[0, k], rho[1, k])
+            if own == 0:
+                a += 1
+                above_a += int(p[k] >= cut)
+            elif own == 1:
+                b += 1
+                below_b += int(p[k] < cut)
+        if a + b == 0:
+            continue
+        straight, crossed = above_a + below_b, a - above_a + b - below_b
+        swapped, least = crossed < straight, min(straight, crossed)
+        if least > max(2.0, 0.02 * (a + b)) and a > 0 and b > 0:
+            cut, swapped = _better_cut(rho, p, s, t, a, b, cut, swapped, least)
+        for k in range(s, t):
+            side[k] = 0 if (p[k] < cut) != swapped else 1
+
+
+@jit
+def _better_cut(
+    rho: Array, p: Array, s: int, t: int, a: int, b: int, cut: float, swapped: bool, least: int
+) -> tuple[float, bool]:
+    """The cut between neighbours of different owners that has fewest beams on the wrong side."""
+    best = float(least)
+    found, found_swapped = cut, swapped
+    before_a = before_b = 0
+    last, last_p = -1, 0.0
+    for k in range(s, t):
+        own = _owner(rho[0, k], rho[1, k])
+        if own < 0:
+            continue
+        if last >= 0 and own != last:
+            here = 0.5 * (last_p + p[k])
+            straight, crossed = a - before_a + before_b, before_a + b - before_b
+            wrong = min(straight, crossed) + 1e-6 * abs(here - cut)
+            if wrong < best and min(straight, crossed) < least:
+                best, found, found_swapped = wrong, here, crossed < straight
+        before_a += int(own == 0)
+        before_b += int(own == 1)
+        last, last_p = own, p[k]
+    return found, found_swapped
+
+
+@jit
+def through(
+    corners: Array, p: Array, r: Array, start: Ints, eye: Array, nearest: Array, depth: float, sigma: float
+) -> int:
+    """How many beams went in between the mouth corners (2, 2); see ownership.through."""
+    passed = between = 0
+    for g in range(eye.shape[0]):
+        s, t = start[g], start[g + 1]
+        if t - s < 3:
+            continue
+        ox, oy, lx, ly = eye[g, 0], eye[g, 1], eye[g, 2], eye[g, 3]
+        low, high, level = np.inf, -np.inf, 0.0
+        for c in range(2):
+            x, y = corners[c, 0] - ox, corners[c, 1] - oy
+            bearing = pseudo_angle(lx * x + ly * y, lx * y - ly * x)
+            low, high, level = min(low, bearing), max(high, bearing), max(level, math.hypot(x, y))
+        step = 0.5 * float(np.median(p[s + 1 : t] - p[s : t - 1]))
+        for k in range(_lower(p, s, t, low - step), _lower(p, s, t, high + step)):
+            own = abs(r[k] - nearest[k]) < 4.0 * sigma and r[k] > level + 2.0 * sigma
+            passed += int(r[k] < 0.0 or r[k] > level + depth or own)
+            between += 1
+    return passed if 2 * passed >= between else 0
+
+
+@jit
 def log_table(amplitude: float, scale: float, table: Array) -> None:
     """Fill row 0 with log(1 + a) and row 1 with a / (1 + a), a = A exp(-q / 2), q = index * scale."""
     for i in range(table.shape[1]):
@@ -532,6 +665,156 @@ def posterior(
     info[8] = log_likelihood(
         edges, pose, p, d, r, start, eye, off, deep, margin, lim, sigma, spread, table, scale, rho, face
     )
+
+
+@jit
+def component(
+    rows: Array,
+    at: Array,
+    begin: Array,
+    use: NDArray[np.bool_],
+    p: Array,
+    d: Array,
+    r: Array,
+    start: Ints,
+    eye: Array,
+    off: Array,
+    deep: Array,
+    margin: float,
+    lim: Array,
+    near: float,
+    few: int,
+    sigma: float,
+    spread: float,
+    table: Array,
+    scale: float,
+    prior: Array,
+    window: float,
+    least: float,
+    cells: int,
+    draws: Array,
+    out: Array,
+) -> bool:
+    """Posterior of one component from the beams in ``use``; False where fewer than ``few`` meet it.
+
+    Parameters
+    ----------
+    rows : (m, 6)
+        Edges of the designed component.
+    at : (3,)
+        Pose that the prior is centred on; the returns within ``near`` of the component there set the pivot.
+    begin : (3,)
+        Another pose that the pilot may start from; NaN for none. The one with more evidence counts.
+    out : (36,) out
+        Pose (3), covariance (9), pivot (2), covariance about the pivot (9), info (12), radius.
+    """
+    n = 0
+    for k in range(use.shape[0]):
+        n += int(use[k])
+    p2, d2, r2 = np.empty(n), np.empty((2, n)), np.empty(n)
+    off2, deep2, lim2 = np.empty(n), np.empty(n), np.empty(n)
+    start2 = np.empty(start.shape[0], np.int64)
+    i = 0
+    for g in range(eye.shape[0]):
+        start2[g] = i
+        for k in range(start[g], start[g + 1]):
+            if use[k]:
+                p2[i], d2[0, i], d2[1, i], r2[i] = p[k], d[0, k], d[1, k], r[k]
+                off2[i], deep2[i], lim2[i] = off[k], deep[k], lim[k]
+                i += 1
+    start2[start.shape[0] - 1] = i
+    rho, face = np.full(n, np.inf), np.full(n, -1, np.int64)
+    cos, sin = math.cos(at[2]), math.sin(at[2])
+    predict(rows, cos, sin, at[0], at[1], p2, d2, start2, eye, rho, face)
+    count, px, py = 0, 0.0, 0.0
+    points = np.empty((n, 2))
+    for g in range(eye.shape[0]):
+        for k in range(start2[g], start2[g + 1]):
+            if face[k] >= 0 and r2[k] > 0.0 and abs(r2[k] - rho[k]) < near:
+                points[count, 0] = eye[g, 0] + d2[0, k] * r2[k]
+                points[count, 1] = eye[g, 1] + d2[1, k] * r2[k]
+                px += points[count, 0]
+                py += points[count, 1]
+                count += 1
+    if count < few:
+        return False
+    px /= count
+    py /= count
+    square = 0.0
+    for k in range(count):
+        square += (points[k, 0] - px) ** 2 + (points[k, 1] - py) ** 2
+    rs = max(math.sqrt(square / count), 0.005)
+    lx, ly = at[0] - px, at[1] - py
+    moved = np.empty_like(rows)
+    for e in range(rows.shape[0]):
+        for j in range(3):
+            x, y = rows[e, 2 * j], rows[e, 2 * j + 1]
+            moved[e, 2 * j], moved[e, 2 * j + 1] = cos * x - sin * y, sin * x + cos * y
+            if j < 2:
+                moved[e, 2 * j] += lx
+                moved[e, 2 * j + 1] += ly
+    seat = eye.copy()
+    seat[:, 0] -= px
+    seat[:, 1] -= py
+    first, mean, cov, info = np.zeros(3), np.empty(3), np.empty((3, 3)), np.zeros(12)
+    out[12], out[13], out[35] = px, py, rs
+    posterior(
+        moved, rs, p2, d2, r2, start2, seat, off2, deep2, margin, lim2, sigma, spread, table, scale, prior,
+        first, window, least, cells, draws, mean, cov, info,
+    )  # fmt: skip
+    _put(at, mean, cov, info, out)
+    if math.isnan(begin[0]) or not _apart(begin, out, max(0.003, sigma)):
+        return True
+    turn = begin[2] - at[2]
+    first[0] = begin[0] - px - (math.cos(turn) * lx - math.sin(turn) * ly)
+    first[1] = begin[1] - py - (math.sin(turn) * lx + math.cos(turn) * ly)
+    first[2] = turn
+    before = info[0]
+    info[:] = 0.0
+    posterior(
+        moved, rs, p2, d2, r2, start2, seat, off2, deep2, margin, lim2, sigma, spread, table, scale, prior,
+        first, window, least, cells, draws, mean, cov, info,
+    )  # fmt: skip
+    if info[0] > before + 1.0:
+        _put(at, mean, cov, info, out)
+    return True
+
+
+@jit
+def _put(at: Array, mean: Array, cov: Array, info: Array, out: Array) -> None:
+    """Pose and covariances of a posterior about the pivot, out[12:14], for the section's frame."""
+    px, py, rs = out[12], out[13], out[35]
+    phi = mean[2] / rs
+    c, s = math.cos(phi), math.sin(phi)
+    x, y = c * (at[0] - px) - s * (at[1] - py), s * (at[0] - px) + c * (at[1] - py)
+    out[0], out[1], out[2] = x + mean[0] + px, y + mean[1] + py, at[2] + phi
+    for i in range(3):
+        for j in range(3):
+            out[14 + 3 * i + j] = cov[i, j] / ((rs if i == 2 else 1.0) * (rs if j == 2 else 1.0))
+    # (u, v, theta) of a motion about the frame's origin: the shift gains theta x arm
+    a = out[14:23].reshape((3, 3))
+    arm = (-y, x)
+    for i in range(3):
+        for j in range(3):
+            v = a[i, j]
+            if i < 2:
+                v += arm[i] * a[2, j]
+            if j < 2:
+                v += a[i, 2] * arm[j]
+            if i < 2 and j < 2:
+                v += arm[i] * arm[j] * a[2, 2]
+            out[3 + 3 * i + j] = v
+    out[23:35] = info
+
+
+@jit
+def _apart(begin: Array, out: Array, slack: float) -> bool:
+    """Whether two poses differ by more than noise explains at the pivot."""
+    turn = begin[2] - out[2]
+    x, y = out[12] - out[0], out[13] - out[1]
+    c, s = math.cos(turn), math.sin(turn)
+    du, dv = c * x - s * y + begin[0] - out[12], s * x + c * y + begin[1] - out[13]
+    return math.hypot(du, dv) > slack or abs(turn) > math.radians(2.0)
 
 
 @jit

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,15 +56,20 @@ class BeamModel:
         cls, sensor: SensorConfig, *, sigma: float | None = None, outliers: float | None = None
     ) -> BeamModel:
         """Make the model of a sensor; shares of zero are floored, for nothing is impossible."""
-        s = sensor.sigma if sigma is None else sigma
-        e_o = max(sensor.outlier_share if outliers is None else outliers, _SHARE_FLOOR)
-        e_m = max(sensor.miss_share, _SHARE_FLOOR)
-        amplitude = max(1.0 - e_o - e_m, 0.05) * sensor.max_range / (e_o * s * math.sqrt(2.0 * math.pi))
-        table = np.empty((2, _TABLE))
-        scale = 2.0 * math.log(max(amplitude, 2.0) / 1e-3) / (_TABLE - 1)
-        _kernels.log_table(amplitude, scale, table)
-        past = min(math.log(e_m / max(1.0 - e_m - e_o, 0.05)), 0.0)
-        return cls(s, amplitude, past if sensor.missing_means_gap else 0.0, past, table, scale)
+        return _model(sensor, sigma, outliers)
+
+
+@lru_cache(maxsize=64)
+def _model(sensor: SensorConfig, sigma: float | None, outliers: float | None) -> BeamModel:
+    s = sensor.sigma if sigma is None else sigma
+    e_o = max(sensor.outlier_share if outliers is None else outliers, _SHARE_FLOOR)
+    e_m = max(sensor.miss_share, _SHARE_FLOOR)
+    amplitude = max(1.0 - e_o - e_m, 0.05) * sensor.max_range / (e_o * s * math.sqrt(2.0 * math.pi))
+    table = np.empty((2, _TABLE))
+    scale = 2.0 * math.log(max(amplitude, 2.0) / 1e-3) / (_TABLE - 1)
+    _kernels.log_table(amplitude, scale, table)
+    past = min(math.log(e_m / max(1.0 - e_m - e_o, 0.05)), 0.0)
+    return BeamModel(s, amplitude, past if sensor.missing_means_gap else 0.0, past, table, scale)
 
 
 @dataclass(frozen=True)
@@ -136,9 +141,7 @@ class BeamSet:
     @cached_property
     def spacing(self) -> float:
         """Median angle between neighbouring beams, rad; 0 for fewer than two."""
-        step = np.abs(self.d[0, 1:] * self.d[1, :-1] - self.d[1, 1:] * self.d[0, :-1])
-        step = step[step > 1e-7]
-        return float(np.median(step)) if len(step) else 0.0
+        return float(_kernels.median_step(self.d))
 
     @property
     def points(self) -> Array:
@@ -153,37 +156,6 @@ def edge_rows(profile: Profile, pose: Pose2D | None = None) -> Array:
     if pose is not None:
         edges, normals = pose.apply(edges), pose.turn(normals)
     return np.ascontiguousarray(np.concatenate([edges.reshape(-1, 4), normals], axis=1))
-
-
-def range_sd(
-    rows: Array, beams: BeamSet, rho: Array, face: Ints, pivot: Array, covariance: Array
-) -> tuple[Array, Array]:
-    """How far a pose's own uncertainty moves each predicted range, to first order.
-
-    Parameters
-    ----------
-    rows : ndarray, shape (m, 6)
-        Edges at that pose.
-    pivot, covariance : ndarray, shape (2,) and (3, 3)
-        Of (u, v, theta) of a motion about the pivot.
-
-    Returns
-    -------
-    sd : ndarray, shape (n,)
-        m; g C g^T with g = [n, n x (p - pivot)] / (n.d) (METHOD, section 4, step 5). 0 where nothing is met.
-    cosine : ndarray, shape (n,)
-        n.d, negative; -1 where nothing is met.
-    """
-    k = np.flatnonzero(face >= 0)
-    sd, cosine = np.zeros(len(face)), np.full(len(face), -1.0)
-    n, d = rows[face[k], 4:6], beams.d[:, k].T
-    c = np.minimum((n * d).sum(axis=1), -1e-6)
-    origin = np.repeat(beams.eye[:, :2], np.diff(beams.start), axis=0)[k]
-    arm = origin + d * rho[k, None] - pivot
-    g = np.column_stack([n, n[:, 1] * arm[:, 0] - n[:, 0] * arm[:, 1]]) / c[:, None]
-    sd[k] = np.sqrt(np.maximum(((g @ covariance) * g).sum(axis=1), 0.0))
-    cosine[k] = c
-    return sd, cosine
 
 
 def predict_ranges(rows: Array, beams: BeamSet) -> tuple[Array, Ints]:

@@ -7,6 +7,7 @@ passes between them, a second round repeats each posterior given the other compo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from bimfit.estimation import _kernels
 from bimfit.estimation.likelihood import BeamModel, BeamSet
-from bimfit.geometry.pose import Array
+from bimfit.geometry.pose import Array, Pose2D
 
 Mask = NDArray[np.bool_]
 Ints = NDArray[np.int64]
@@ -27,14 +28,34 @@ class Scene:
 
     Attributes
     ----------
-    rho : tuple of ndarray, shape (n,)
+    ranges : ndarray, shape (2, n)
         Range to A and to B by itself; inf where the beam does not meet it.
-    face : tuple of ndarray, shape (n,)
+    faces : ndarray, shape (2, n)
         Edge met, -1 for none.
     """
 
-    rho: tuple[Array, Array]
-    face: tuple[Ints, Ints]
+    ranges: Array
+    faces: Ints
+
+    @classmethod
+    def at(cls, rows: tuple[Array, Array], poses: Sequence[Pose2D], beams: BeamSet) -> Scene:
+        """Predict both components, given by their edges (m, 6) as designed."""
+        ranges, faces = np.empty((2, len(beams))), np.empty((2, len(beams)), np.int64)
+        a, b = poses
+        _kernels.scene(
+            *rows, a.as_array(), b.as_array(), beams.p, beams.d, beams.start, beams.eye, ranges, faces
+        )
+        return cls(ranges, faces)
+
+    @property
+    def rho(self) -> tuple[Array, Array]:
+        """Range to A and to B."""
+        return self.ranges[0], self.ranges[1]
+
+    @property
+    def face(self) -> tuple[Ints, Ints]:
+        """Edge of A and of B that is met."""
+        return self.faces[0], self.faces[1]
 
     @property
     def owner(self) -> Ints:
@@ -52,6 +73,8 @@ class Scene:
 def split_side(scene: Scene, beams: BeamSet, centre: Array) -> Ints:
     """Give every beam to the component on whose side of the gap's centre it passes.
 
+    Where that leaves many beams on the wrong side, the cut that separates the components best is taken.
+
     Parameters
     ----------
     centre : ndarray, shape (2,)
@@ -62,43 +85,11 @@ def split_side(scene: Scene, beams: BeamSet, centre: Array) -> Ints:
     ndarray, shape (n,)
         0 for A, 1 for B, -1 where a group of beams meets neither.
     """
-    side = np.full(len(beams), -1, np.int64)
-    owner = scene.owner
-    for g in range(len(beams.eye)):
-        s, t = int(beams.start[g]), int(beams.start[g + 1])
-        own, p = owner[s:t], beams.p[s:t]
-        if not np.any(own >= 0):
-            continue
-        ox, oy, lx, ly = beams.eye[g]
-        cx, cy = centre[0] - ox, centre[1] - oy
-        cut = _kernels.pseudo_angle(lx * cx + ly * cy, lx * cy - ly * cx)
-        low, swapped = _best_cut(own, p, cut)
-        side[s:t] = np.where((p < low) != swapped, 0, 1)
+    side = np.empty(len(beams), np.int64)
+    _kernels.split_side(
+        scene.ranges, beams.p, beams.start, beams.eye, float(centre[0]), float(centre[1]), side
+    )
     return side
-
-
-def _best_cut(own: Ints, p: Array, cut: float) -> tuple[float, bool]:
-    """The cut that separates A from B best, preferring ``cut``, and whether B lies below it."""
-    a, b = p[own == 0], p[own == 1]
-    wrong = [int((a >= cut).sum() + (b < cut).sum()), int((a < cut).sum() + (b >= cut).sum())]
-    swapped = wrong[1] < wrong[0]
-    if min(wrong) <= max(2, 0.02 * (len(a) + len(b))) or not len(a) or not len(b):
-        return cut, swapped
-    owned = own >= 0
-    q, w = p[owned], own[owned]
-    changes = np.flatnonzero(w[1:] != w[:-1])
-    if not len(changes):
-        return cut, swapped
-    cuts = 0.5 * (q[changes] + q[changes + 1])
-    below_a = np.searchsorted(a, cuts)
-    below_b = np.searchsorted(b, cuts)
-    straight = (len(a) - below_a) + below_b
-    crossed = below_a + (len(b) - below_b)
-    best = np.minimum(straight, crossed)
-    i = int(np.argmin(best + 1e-6 * np.abs(cuts - cut)))
-    if best[i] >= min(wrong):
-        return cut, swapped
-    return float(cuts[i]), bool(crossed[i] < straight[i])
 
 
 @dataclass(frozen=True)
@@ -133,14 +124,9 @@ def cover_cost(beams: BeamSet, model: BeamModel, margin: float) -> Cost:
     A beam that returned nothing, or from behind, speaks against a face in its way. Only a return that a
     neighbouring beam bears out counts as from behind: floors come in runs, outliers alone.
     """
-    n = len(beams)
-    borne_out = np.zeros(n, bool)
-    if n > 1:
-        pair = (np.abs(np.diff(beams.r)) < _SAME_SURFACE) & (beams.r[1:] > 0.0) & (beams.r[:-1] > 0.0)
-        borne_out[1:] |= pair
-        borne_out[:-1] |= pair
-    off = np.where(beams.r < 0.0, model.miss, 0.0)
-    return Cost(off, np.where(borne_out, model.past, 0.0), margin, np.full(n, np.inf))
+    off, deep = np.empty(len(beams)), np.empty(len(beams))
+    _kernels.cover_cost(beams.r, model.miss, model.past, _SAME_SURFACE, off, deep)
+    return Cost(off, deep, margin, np.full(len(beams), np.inf))
 
 
 def explained_by(rho: Array, beams: BeamSet, model: BeamModel, sigma: float) -> Array:
@@ -200,25 +186,9 @@ def through(corners: tuple[Array, Array], beams: BeamSet, nearest: Array, depth:
     int
         0 as well where fewer than half of the beams between the corners did so: then something is there.
     """
-    passed = between = 0
-    for g in range(len(beams.eye)):
-        s, t = int(beams.start[g]), int(beams.start[g + 1])
-        if t - s < 3:
-            continue
-        ox, oy, lx, ly = beams.eye[g]
-        bearing, level = [], 0.0
-        for x, y in corners:
-            dx, dy = x - ox, y - oy
-            bearing.append(_kernels.pseudo_angle(lx * dx + ly * dy, lx * dy - ly * dx))
-            level = max(level, float(np.hypot(dx, dy)))
-        p = beams.p[s:t]
-        step = 0.5 * float(np.median(np.diff(p)))
-        lo, hi = np.searchsorted(p, (min(bearing) - step, max(bearing) + step))
-        r = beams.r[s + lo : s + hi]
-        own = (np.abs(r - nearest[s + lo : s + hi]) < 4.0 * sigma) & (r > level + 2.0 * sigma)
-        passed += int(((r < 0.0) | (r > level + depth) | own).sum())
-        between += len(r)
-    return passed if 2 * passed >= between else 0
+    return int(
+        _kernels.through(np.array(corners), beams.p, beams.r, beams.start, beams.eye, nearest, depth, sigma)
+    )
 
 
 def meeting(scene: Scene, few: int) -> bool:

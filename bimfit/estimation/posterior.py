@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bimfit.estimation import _kernels
 from bimfit.estimation.likelihood import BeamModel, BeamSet
@@ -15,6 +16,10 @@ from bimfit.geometry.pose import Array, Pose2D
 
 _CELLS = 24
 _NU = 6
+_NEAR = 0.03
+"""Returns that far from the component at the prior's centre are on it, m."""
+_MIN_HITS = 3
+_NOWHERE = np.full(3, np.nan)
 _BEARING = 0.05
 """A beam's bearing is blurred by this share of the spacing: footprints and encoders are never points."""
 
@@ -97,11 +102,12 @@ def component_posterior(
     start: Pose2D,
     beams: BeamSet,
     cost: Cost,
-    centred_on: Array,
     model: BeamModel,
     window: Window,
+    *,
+    use: NDArray[np.bool_] | None = None,
     begin: Pose2D | None = None,
-) -> Posterior:
+) -> Posterior | None:
     """Integrate the beam likelihood over the poses of one component.
 
     Parameters
@@ -109,54 +115,44 @@ def component_posterior(
     rows : ndarray, shape (m, 6)
         Edges of the designed component, :func:`~bimfit.estimation.likelihood.edge_rows`.
     start : Pose2D
-        The pose that the prior is centred on.
+        The pose that the prior is centred on. The centroid of the returns near the component there becomes
+        the pivot.
     cost : Cost
         What covering each beam adds to the log-likelihood.
-    centred_on : ndarray, shape (k, 2)
-        Returns on the component, whose centroid becomes the pivot.
+    use : ndarray of bool, shape (n,), optional
+        Beams that speak for the component; all unless told.
     begin : Pose2D, optional
-        Where the pilot starts; ``start`` unless told.
+        Another place to start from; it counts where it leads elsewhere and explains more.
+
+    Returns
+    -------
+    Posterior or None
+        None where hardly any return lies on the component.
     """
-    pivot = centred_on.mean(axis=0)
-    radius = max(float(np.sqrt(np.mean(np.sum((centred_on - pivot) ** 2, axis=1)))), 0.005)
-    local = Pose2D(start.u - pivot[0], start.v - pivot[1], start.theta)
-    moved = np.empty_like(rows)
-    moved[:, 0:2], moved[:, 2:4] = local.apply(rows[:, 0:2]), local.apply(rows[:, 2:4])
-    moved[:, 4:6] = local.turn(rows[:, 4:6])
-    set_ = beams.moved_origin(pivot)
-    first = np.zeros(3)
-    if begin is not None:
-        theta = begin.theta - start.theta
-        shift = np.array([begin.u, begin.v]) - pivot - Pose2D(theta=theta).apply((local.u, local.v))
-        first[:] = shift[0], shift[1], theta
     spread = (_BEARING * beams.spacing / model.sigma) ** 2
-    mean, cov, info = np.empty(3), np.empty((3, 3)), np.zeros(12)
-    _kernels.posterior(
-        moved, radius, set_.p, set_.d, set_.r, set_.start, set_.eye, cost.off, cost.deep,
-        cost.margin, cost.limit, model.sigma, spread,
-        model.table, model.scale, np.array([window.shift, window.shift, window.angle]), first,
-        window.reach, window.least, _CELLS, _draws(), mean, cov, info,
+    other = _NOWHERE if begin is None else begin.as_array()
+    out = np.empty(36)
+    found = _kernels.component(
+        rows, start.as_array(), other, np.ones(len(beams), bool) if use is None else use, beams.p, beams.d,
+        beams.r, beams.start, beams.eye, cost.off, cost.deep, cost.margin, cost.limit, _NEAR, _MIN_HITS,
+        model.sigma, spread, model.table, model.scale, np.array([window.shift, window.shift, window.angle]),
+        window.reach, window.least, _CELLS, _draws(), out,
     )  # fmt: skip
-    phi = mean[2] / radius
-    turned = Pose2D(theta=phi).apply((local.u, local.v))
-    pose = Pose2D(
-        float(turned[0] + mean[0] + pivot[0]), float(turned[1] + mean[1] + pivot[1]), start.theta + phi
-    )
-    scale = np.diag([1.0, 1.0, 1.0 / radius])
-    about_pivot = scale @ cov @ scale
-    jacobian = np.eye(3)
-    jacobian[0, 2], jacobian[1, 2] = -turned[1], turned[0]
+    if not found:
+        return None
+    u, v, theta = out[:3].tolist()
+    evidence, ranges, _, _, _, sd, mass, offset, _, _, ess, _, radius = out[23:36].tolist()
     return Posterior(
-        pose=pose,
-        covariance=jacobian @ about_pivot @ jacobian.T,
-        pivot=pivot,
-        pivot_covariance=about_pivot,
-        evidence=float(info[0]),
-        weak_axis=info[2:5].copy(),
-        weak_sd_ranges=float(info[1]),
-        weak_sd=float(info[5]),
-        rival_mass=float(info[6]),
-        rival_offset=float(info[7]),
+        pose=Pose2D(u, v, theta),
+        covariance=out[3:12].reshape(3, 3),
+        pivot=out[12:14],
+        pivot_covariance=out[14:23].reshape(3, 3),
+        evidence=evidence,
+        weak_axis=out[25:28],
+        weak_sd_ranges=ranges,
+        weak_sd=sd,
+        rival_mass=mass,
+        rival_offset=offset,
         radius=radius,
-        ess=float(info[10]),
+        ess=ess,
     )

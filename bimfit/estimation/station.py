@@ -12,7 +12,7 @@ import numpy as np
 from bimfit.config import FitConfig, SensorConfig
 from bimfit.estimation import checks
 from bimfit.estimation.cloud import irregular_sensor, virtual_beams
-from bimfit.estimation.likelihood import BeamModel, BeamSet, edge_rows, predict_ranges, range_sd
+from bimfit.estimation.likelihood import BeamModel, BeamSet, edge_rows
 from bimfit.estimation.ownership import (
     Cost,
     Ints,
@@ -27,7 +27,7 @@ from bimfit.estimation.ownership import (
     through,
 )
 from bimfit.estimation.posterior import Posterior, Window, component_posterior
-from bimfit.estimation.residuals import excused, residuals_of
+from bimfit.estimation.residuals import residuals_of
 from bimfit.estimation.result import ComponentEstimate, Residuals, StationEstimate
 from bimfit.estimation.slide import SlideResult, best_start, designed_width
 from bimfit.geometry.joint_section import JointSection
@@ -35,9 +35,7 @@ from bimfit.geometry.pose import Array, Pose2D
 from bimfit.geometry.slice import Slice
 from bimfit.geometry.status import Status
 
-_NEAR = 0.03
 _CLIP_MARGIN = 0.025
-_MIN_HITS = 3
 _FEW_THROUGH = 3
 _WORTH_A_LOOK = -15.0
 
@@ -167,11 +165,7 @@ def _nothing(
 
 def _scene(context: _Context, poses: Sequence[Pose2D]) -> Scene:
     """Predicted ranges of both components at a pose each."""
-    met = [
-        predict_ranges(edge_rows(component, pose), context.beams)
-        for component, pose in zip(context.section.components, poses, strict=True)
-    ]
-    return Scene((met[0][0], met[1][0]), (met[0][1], met[1][1]))
+    return Scene.at(context.rows, poses, context.beams)
 
 
 def _depth(context: _Context) -> float:
@@ -287,26 +281,8 @@ def _one(
     begin: Pose2D | None,
 ) -> Posterior | None:  # fmt: skip
     """Posterior of one component from the beams in ``use``; None where hardly any meets it."""
-    beams = context.beams.take(use)
-    rho, face = predict_ranges(edge_rows(context.section.components[which], prior), beams)
-    near = (face >= 0) & (beams.r > 0.0) & (np.abs(beams.r - rho) < _NEAR)
-    if int(near.sum()) < _MIN_HITS:
-        return None
-    points = beams.points[near]
-    args = (beams, cost.take(use), points, context.model, window)
-    result = component_posterior(context.rows[which], prior, *args)
-    if begin is not None and _apart(begin, result.pose, result.pivot, context.sensor.sigma):
-        other = component_posterior(context.rows[which], prior, *args, begin=begin)
-        if other.evidence > result.evidence + 1.0:
-            return other
-    return result
-
-
-def _apart(a: Pose2D, b: Pose2D, pivot: Array, sigma: float) -> bool:
-    """Whether two poses differ by more than noise explains where the data are."""
-    back = b.inverse().apply(pivot)
-    return bool(
-        np.hypot(*(a.apply(back) - pivot)) > max(0.003, sigma) or abs(a.theta - b.theta) > math.radians(2.0)
+    return component_posterior(
+        context.rows[which], prior, context.beams, cost, context.model, window, use=use, begin=begin
     )
 
 
@@ -315,10 +291,7 @@ def _residuals(
 ) -> Residuals:
     if posterior is None:
         return Residuals()
-    beams, sigma = context.beams, context.sensor.sigma
-    rho, face = scene.rho[which], scene.face[which]
-    rows = edge_rows(context.section.components[which], posterior.pose)
-    sd, cosine = range_sd(rows, beams, rho, face, posterior.pivot, posterior.pivot_covariance)
-    silent = excused(beams.r, rho, sd, cosine, sigma)
-    blocked = scene.rho[1 - which] < rho
-    return residuals_of(beams, rho, face, (side == which) & usable & ~blocked, sigma, silent)
+    return residuals_of(
+        context.rows[which], posterior, context.beams, (scene.rho[which], scene.face[which]),
+        scene.rho[1 - which], (side == which) & usable, context.sensor.sigma,
+    )  # fmt: skip

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bimfit.config import FitConfig, SensorConfig
-from bimfit.estimation.residuals import excused, longest_run
+from bimfit.estimation._kernels_residuals import excused, longest_run
 from bimfit.estimation.station import estimate_station
 from bimfit.geometry.pose import Pose2D
 from bimfit.geometry.profile import Profile
@@ -174,7 +174,8 @@ def test_a_grazing_return_is_excused_only_as_far_as_its_pose_is_uncertain():
     rho, sd = np.full(4, 0.5), np.array([0.02, 0.02, 0.001, 0.02])
     cosine = np.array([-0.05, -0.05, -0.05, -0.9])
     r = np.array([0.55, 0.65, 0.55, 0.55])
-    assert excused(r, rho, sd, cosine, 0.003).tolist() == [True, False, False, False]
+    found = [excused(*row, 0.003) for row in zip(r, rho, sd, cosine, strict=True)]
+    assert found == [True, False, False, False]
 
 
 def test_longest_run():

@@ -1,0 +1,213 @@
+"""Residual figures of one component in one pass (METHOD, section 5); calls no kernel of another file."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bimfit._kernels import jit
+from bimfit.geometry.pose import Array
+
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+GRAZING = 0.3
+ENDS = 6
+FIGURES = 14
+
+
+@jit
+def longest_run(flags: Mask) -> int:
+    """Length of the longest unbroken run of True."""
+    best = run = 0
+    for k in range(flags.shape[0]):
+        run = run + 1 if flags[k] else 0
+        best = max(best, run)
+    return best
+
+
+@jit
+def excused(r: float, rho: float, sd: float, cosine: float, sigma: float) -> bool:
+    """Whether a grazing return says nothing about the shape: the pose's uncertainty explains its misfit.
+
+    ``sd`` is how far that uncertainty moves the predicted range, ``cosine`` n.d.
+    """
+    explained = abs(r - rho) < 4.0 * math.hypot(sd, sigma)
+    return cosine > -GRAZING and sd > sigma and r > 0.0 and explained
+
+
+@jit
+def range_sd(
+    nx: float, ny: float, dx: float, dy: float, ax: float, ay: float, cov: Array
+) -> tuple[float, float]:
+    """How far a pose's uncertainty moves a predicted range, to first order, and n.d.
+
+    sqrt(g C g^T) with g = [n, n x (p - pivot)] / (n.d) (METHOD, section 4, step 5); (ax, ay) = p - pivot.
+    """
+    c = min(nx * dx + ny * dy, -1e-6)
+    g0, g1, g2 = nx / c, ny / c, (ny * ax - nx * ay) / c
+    v = g0 * (cov[0, 0] * g0 + 2.0 * cov[0, 1] * g1 + 2.0 * cov[0, 2] * g2)
+    v += g1 * (cov[1, 1] * g1 + 2.0 * cov[1, 2] * g2) + g2 * cov[2, 2] * g2
+    return math.sqrt(max(v, 0.0)), c
+
+
+@jit
+def residuals(
+    edges: Array,
+    pose: Array,
+    pivot: Array,
+    cov: Array,
+    rho: Array,
+    face: Ints,
+    other: Array,
+    used: Mask,
+    d: Array,
+    r: Array,
+    start: Ints,
+    eye: Array,
+    spacing: float,
+    sigma: float,
+    out: Array,
+    z: Array,
+    places: Array,
+) -> int:
+    """Residuals of the returns on a component, and what they say of it.
+
+    Parameters
+    ----------
+    edges, pose : (m, 6) and (3,)
+        Of the designed component, and where it is.
+    pivot, cov : (2,) and (3, 3)
+        Its covariance about the pivot, for grazing returns.
+    rho, face, other : (n,)
+        Range to the component and the edge met, and the range to the other component, which may hide it.
+    used : (n,)
+        Beams that speak for it; cleared where the other hides it.
+    out : (FIGURES,) out
+        Beams, covered, inliers, rms, chi2, outlier share, miss share, their longest runs, cumulated
+        range, lag 1, unexplained, edge; in the order of :class:`~bimfit.estimation.result.Residuals`.
+    z, places : (n,), (n, 2) out
+        Residuals and places of the inliers.
+
+    Returns
+    -------
+    int
+        How many rows of ``z`` and ``places`` are filled.
+    """
+    n = r.shape[0]
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    faces = np.empty(n, np.int64)
+    stray, missed = np.empty(n, np.bool_), np.empty(n, np.bool_)
+    beams = covered = quiet_all = quiet = count = strays = misses = 0
+    for q in range(eye.shape[0]):
+        for k in range(start[q], start[q + 1]):
+            used[k] = used[k] and not other[k] < rho[k]
+            if not used[k]:
+                continue
+            beams += 1
+            e = face[k]
+            if e < 0:
+                continue
+            x, y = eye[q, 0] + d[0, k] * rho[k], eye[q, 1] + d[1, k] * rho[k]
+            nx = cos * edges[e, 4] - sin * edges[e, 5]
+            ny = sin * edges[e, 4] + cos * edges[e, 5]
+            sd, c = range_sd(nx, ny, d[0, k], d[1, k], x - pivot[0], y - pivot[1], cov)
+            misfit = r[k] - rho[k]
+            if excused(r[k], rho[k], sd, c, sigma):
+                quiet_all += 1
+                quiet += int(abs(misfit) < 4.0 * sigma)
+                continue
+            inlier = r[k] > 0.0 and abs(misfit) < 4.0 * sigma
+            stray[covered], missed[covered] = r[k] > 0.0 and not inlier, not r[k] > 0.0
+            strays += int(stray[covered])
+            misses += int(missed[covered])
+            covered += 1
+            if inlier:
+                z[count], faces[count] = misfit, e
+                places[count, 0] = eye[q, 0] + d[0, k] * r[k]
+                places[count, 1] = eye[q, 1] + d[1, k] * r[k]
+                count += 1
+    square, mean = 0.0, 0.0
+    for i in range(count):
+        square += z[i] * z[i]
+        mean += z[i] / count
+    out[0], out[1], out[2] = beams, covered + quiet, count + quiet
+    out[3] = math.sqrt(square / count) if count else np.nan
+    out[4] = square / (sigma * sigma) / max(count - 2.2, 1.0) if count else np.nan
+    out[5] = strays / covered if covered else 0.0
+    out[6] = misses / covered if covered else 0.0
+    out[7], out[8] = longest_run(stray[:covered]), longest_run(missed[:covered])
+    out[9] = _cumulated(z[:count], mean, sigma)
+    out[10] = 0.0
+    if count > 3:
+        lag = 0.0
+        for i in range(count - 1):
+            lag += z[i + 1] * z[i]
+        out[10] = lag / (count - 1) / max(square / count, 1e-30)
+    out[11] = _continues(rho, face, used, r, start, spacing, sigma)
+    out[12] = _edge_drop(z[:count], faces[:count], edges.shape[0], sigma)
+    out[13] = quiet_all
+    return count
+
+
+@jit
+def _cumulated(z: Array, mean: float, sigma: float) -> float:
+    """Range of the cumulated standardised residuals over sqrt(n): bends and wrong shapes show here."""
+    n = z.shape[0]
+    if n <= 3:
+        return 0.0
+    low = high = walk = square = 0.0
+    for i in range(n):
+        walk += z[i] - mean
+        low, high = min(low, walk), max(high, walk)
+        square += (z[i] - mean) ** 2
+    return (high - low) / max(math.sqrt(square / n), sigma) / math.sqrt(n)
+
+
+@jit
+def _edge_drop(z: Array, faces: Ints, names: int, sigma: float) -> float:
+    """How far the last returns at either end of the main face lie behind it, in standard deviations."""
+    n = z.shape[0]
+    if n < 12:
+        return 0.0
+    counts = np.zeros(names, np.int64)
+    for i in range(n):
+        counts[faces[i]] += 1
+    name = np.argmax(counts)
+    main = z[faces == name]
+    m = main.shape[0]
+    worst = -np.inf
+    for end in range(2):
+        total = 0.0
+        for i in range(min(ENDS, m)):
+            total += main[i] if end == 0 else main[m - 1 - i]
+            worst = max(worst, total / math.sqrt(i + 1.0))
+    return max(worst, 0.0) / max(sigma, float(main.std()) * 0.8)
+
+
+@jit
+def _continues(
+    rho: Array, face: Ints, used: Mask, r: Array, start: Ints, spacing: float, sigma: float
+) -> int:
+    """Returns that carry a surface on past where it should end: the edge is not shaped as designed."""
+    longest = 0
+    for g in range(start.shape[0] - 1):
+        s, t = start[g], start[g + 1]
+        low, high = t, s - 1
+        for k in range(s, t):
+            if used[k] and face[k] >= 0:
+                low, high = min(low, k), k
+        if high < s:
+            continue
+        for end in range(2):
+            first, step = (low, -1) if end == 0 else (high, 1)
+            level = rho[first]
+            jump = max(4.0 * sigma, 3.0 * spacing * level)
+            count, k = 0, first + step
+            while s <= k < t and used[k] and r[k] > 0.0 and abs(r[k] - level) < jump:
+                level = r[k]
+                count, k = count + 1, k + step
+            longest = max(longest, count)
+    return longest
