@@ -25,7 +25,7 @@ from bimfit.simulation.rangefinder import aim, cast, inside
 from bimfit.simulation.scenario import Scenario
 from bimfit.simulation.truth import JointTruth
 
-PAUSE = 1.0
+PAUSE = 3.0
 """Without a scan for so long, the next one finds the sensor back at the joint's start, s."""
 _MODELS = (".ifc", ".ifczip", ".ifcxml")
 
@@ -55,8 +55,9 @@ class Emulation:
 class JointRide:
     """A sensor that is carried along a joint and back, over and over, from the first scan that is asked for.
 
-    Between stations the components' poses change linearly. It starts anew when nobody has asked for a scan
-    for a while, so that each program that opens the port sees the joint from its start.
+    It looks ahead at the joint's start in the first turn. Between stations the components' poses change
+    linearly. It starts anew when nobody has asked for a scan for a while, so that each program that opens the
+    port sees the joint from its start, also after a cable was pulled and plugged in again.
 
     Parameters
     ----------
@@ -90,7 +91,7 @@ class JointRide:
         """Ranges (n,) m of beams at bearings (n,) rad, each at its own time (n,), s."""
         begin = float(seconds[0])
         if not 0.0 <= begin - self._last <= PAUSE:
-            self._start = begin
+            self._start = float(seconds[np.argmin(np.abs(bearings))])
         self._last = begin
         return self.seen(bearings, self.position(seconds - self._start))
 

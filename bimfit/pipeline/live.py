@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
@@ -15,20 +16,23 @@ import numpy as np
 from bimfit.bim.stations import design_sections
 from bimfit.config import Config
 from bimfit.errors import ConfigError, ScanError
+from bimfit.estimation.noise import estimate_noise
+from bimfit.estimation.result import StationEstimate
 from bimfit.gap.section import GapSection, gap_section
 from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.line_scan import LineScan
 from bimfit.geometry.pose import Array
+from bimfit.geometry.slice import Slice
 from bimfit.geometry.status import Status
 from bimfit.pipeline.carriage import advanced, carried, held_over
 from bimfit.pipeline.fit import fit_station
 from bimfit.pipeline.simulate import designed, longest_open
 from bimfit.pipeline.survey import load_scan, model_joints, mouth_paths, viewpoint_of
-from bimfit.pipeline.targets import TargetCache, match_reach, with_assumed_view
+from bimfit.pipeline.targets import TargetCache, Targets, match_reach, with_assumed_view
 from bimfit.scan.coverage import covers, sweep_positions
 from bimfit.scan.grid import StationGrid
 from bimfit.scan.slicing import cut_slices
-from bimfit.sensor.clock import SCAN_DELAY, host_clock
+from bimfit.sensor.clock import host_clock
 from bimfit.sensor.counters import Counters
 from bimfit.sensor.hokuyo import Hokuyo
 from bimfit.sensor.sweep import line_scan
@@ -41,9 +45,13 @@ if TYPE_CHECKING:
     from bimfit.bim.model import Model
 
 NEAR = 0.3
+RECENT = 20
+"""So many sweeps say what the sensor's noise is."""
 SWEEPS = 1000
 """So many sweeps are prepared for: building the faster look-up tables pays."""
 _STEP = 0.01
+_PROFILES = 0.02
+"""Distance at which a joint's profile is looked at beforehand, m."""
 
 
 @dataclass(frozen=True)
@@ -83,19 +91,41 @@ class LiveFit:
     def __init__(self, model: Model, joint: Joint, config: Config) -> None:
         self.model, self.joint, self.config = model, joint, config
         self._targets = TargetCache(config)
+        self._sensor = config.sensor
+        self._recent: deque[StationEstimate] = deque(maxlen=RECENT)
         self._mouth = mouth_paths(joint)[0]
         count = math.ceil(self._mouth.length / _STEP)
         s = np.linspace(0.0, self._mouth.length, max(count, 2) + 1)
         self._grid = StationGrid.of([self._mouth.rough_frame(float(x)) for x in s], s)
 
     def prepare(self, height: float) -> None:
-        """Build tables and load kernels with a sweep as designed, seen from ``height``, m; takes seconds."""
+        """Build tables and load kernels with sweeps as designed, seen from ``height``, m; takes seconds.
+
+        Where the joint's profile changes along it, each profile's tables are built.
+        """
         scenario = Scenario(motion="none", sensor_height=height)
-        for share in (0.5, 0.25, 0.75):
-            section = self.section(share * self.joint.length)
-            if section is not None:
-                truth = random_truth((section,), scenario, 0)
-                self.fit(0, section, simulate_scan((section,), truth, scenario, 0))
+        length = self.joint.path.length
+        ready: set[int] = set()
+        for s in np.linspace(0.0, length, math.ceil(length / _PROFILES) + 1):
+            section = self.section(float(s))
+            if section is None:
+                continue
+            sweep = simulate_scan((section,), random_truth((section,), scenario, 0), scenario, 0)
+            targets = self._cut(section, sweep)[1]
+            if id(targets.combined) not in ready:
+                self.fit(0, section, sweep)
+                self._reach_all(targets)
+                ready.add(id(targets.combined))
+        self._recent.clear()
+        self._sensor = self.config.sensor
+
+    def _reach_all(self, targets: Targets) -> None:
+        """Let the tables reach as far as returns do, or one farther off would have them built again."""
+        window = 2.0 * np.array(self.config.search.window[:2])
+        for target in targets.all:
+            low_u, low_v, high_u, high_v = target.box
+            span = np.array([high_u - low_u, high_v - low_v]) + window
+            target.reach(float(0.5 * np.hypot(*np.minimum(span, 2.0 * match_reach(self.config)))))
 
     def section(self, s: float) -> JointSection | None:
         """The design at a place along the joint, m; None where no cross-section shows both components."""
@@ -120,6 +150,20 @@ class LiveFit:
 
     def fit(self, index: int, section: JointSection, sweep: LineScan) -> LiveStation:
         """Fit a sweep in model coordinates to the section that it shows."""
+        slice_, targets = self._cut(section, sweep)
+        config = dataclasses.replace(self.config, sensor=self._sensor)
+        estimate = fit_station(section, slice_, targets, config).estimate
+        assert estimate is not None  # the method that is asked for makes one, always
+        self._learn(estimate)
+        a, b = estimate.components
+        gap = None
+        if estimate.status.measured and a.pose is not None and b.pose is not None:
+            gap = gap_section(
+                section.s, section.frame, section.gap, a.pose, b.pose, a.covariance, b.covariance
+            )
+        return LiveStation(index, section.s, estimate.status, gap)
+
+    def _cut(self, section: JointSection, sweep: LineScan) -> tuple[Slice, Targets]:
         (cut,) = cut_slices(
             sweep,
             [section.frame],
@@ -129,15 +173,13 @@ class LiveFit:
         )
         slice_ = with_assumed_view(cut, section)
         targets = dataclasses.replace(self._targets.get(section, slice_), stations=SWEEPS)
-        estimate = fit_station(section, slice_, targets, self.config).estimate
-        assert estimate is not None  # the method that is asked for makes one, always
-        a, b = estimate.components
-        gap = None
-        if estimate.status.measured and a.pose is not None and b.pose is not None:
-            gap = gap_section(
-                section.s, section.frame, section.gap, a.pose, b.pose, a.covariance, b.covariance
-            )
-        return LiveStation(index, section.s, estimate.status, gap)
+        return slice_, targets
+
+    def _learn(self, estimate: StationEstimate) -> None:
+        """Let the last sweeps' residuals say how the sensor really measures."""
+        if self.config.sensor.adapt:
+            self._recent.append(estimate)
+            self._sensor = estimate_noise(self._recent, self.config.sensor).sensor
 
 
 @dataclass(frozen=True)
@@ -268,8 +310,7 @@ class Live:
                         station = place(sweep.index, line_scan([sweep]), sweep.times)
                         if station is None:
                             return
-                        arrived = sweep.stamp_host + SCAN_DELAY
-                        yield dataclasses.replace(station, latency=clock() - arrived)
+                        yield dataclasses.replace(station, latency=clock() - sweep.received)
         finally:
             self.counters = device.counters
 
@@ -283,16 +324,17 @@ class Live:
         speed = mount.speed
         ready = LiveFit(self.model, self._facing(), self._config)
         ready.prepare(mount.height)
-        first: list[float] = []
+        first: list[float] = []  # when the first sweep looked ahead
         length = ready.joint.path.length
 
         def carried_on(index: int, sweep: LineScan, times: Array) -> LiveStation | None:
-            first[len(first) :] = [float(times[0])] if not first else []
+            ahead = int(np.argmax(sweep.directions[:, 0]))
+            first[len(first) :] = [float(times[ahead])] if not first else []
+            # each beam has its own time; the section is where the sensor was when it looked ahead
             way = speed * (times - first[0])
             if mount.pose is not None:
                 return ready.fit_placed(index, carried(sweep, advanced(mount.pose, way)))
-            # each beam has its own time; the section is where the sensor was half way
-            middle = float(0.5 * (way[0] + way[-1]))
+            middle = float(way[ahead])
             s = mount.start + middle
             if (s > length and speed > 0.0) or (s < 0.0 and speed < 0.0):
                 return None

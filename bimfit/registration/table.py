@@ -320,6 +320,13 @@ class Target:
         """Whether no surface is visible at all."""
         return len(self.edges) == 0
 
+    def reach(self, reach: float) -> None:
+        """Let the tables that there are serve points up to ``reach`` (m) from the pivot."""
+        for key, found in list(self.kept.items()):
+            if isinstance(found, Tables):
+                lattice, bound = key
+                self.tables(lattice, bound, reach)
+
     def tables(self, lattice: Lattice, bound: Bound, reach: float) -> Tables:
         """Tables for a lattice and for points up to ``reach`` (m) from the pivot; built once and kept."""
         key = (lattice, bound)

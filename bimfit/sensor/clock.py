@@ -8,8 +8,8 @@ from collections import deque
 from collections.abc import Callable
 
 STAMP_BITS = 24
-# Recorded: a scan starts to arrive that long after its own stamp, and a full one takes 2.3 ms.
-SCAN_DELAY = 0.101
+SCAN_PHASE = 1.01
+"""Recorded: a scan starts to arrive that long after its own stamp, turns, and a full one takes 2.3 ms."""
 
 
 def host_clock() -> Callable[[], float]:
@@ -37,6 +37,44 @@ class StampUnwrapper:
         return total
 
 
+class StampOrder:
+    """Whether scans' stamps go on as the clock of one device does.
+
+    The sums that guard a scan are weak, and a line that stutters may send one twice. A stamp that does not
+    come after the last one, or a long time after it, is not believed; unless the next one follows it, as when
+    the device's clock was set, or the host slept.
+
+    Parameters
+    ----------
+    turn : float
+        Time between two scans, s.
+    """
+
+    LONGEST = 30.0
+
+    def __init__(self, turn: float) -> None:
+        self._turn = turn
+        self._last: int | None = None
+        self._doubted: int | None = None
+
+    def believes(self, stamp: int) -> bool:
+        """Take a scan's stamp (ms, 24 bits)."""
+        good = self._follows(self._last, stamp, self.LONGEST) or self._follows(
+            self._doubted, stamp, 3.0 * self._turn
+        )
+        if self._last is None or good:
+            self._last, self._doubted = stamp, None
+            return True
+        self._doubted = stamp
+        return False
+
+    def _follows(self, before: int | None, stamp: int, most: float) -> bool:
+        if before is None:
+            return False
+        step = (stamp - before) % (1 << STAMP_BITS) / 1000.0
+        return 0.5 * self._turn < step < max(most, 3.0 * self._turn)
+
+
 class HostClock:
     """Maps the device's seconds to the host's.
 
@@ -47,11 +85,14 @@ class HostClock:
 
     Parameters
     ----------
+    delay : float
+        How long after its own stamp a scan arrives, s.
     window : float
         How far back scans count for the drift, s.
     """
 
-    def __init__(self, window: float = 30.0) -> None:
+    def __init__(self, delay: float = SCAN_PHASE * 0.1, window: float = 30.0) -> None:
+        self.delay = delay
         self.window = window
         self.bounds = (-math.inf, math.inf)
         self._first: float | None = None
@@ -84,7 +125,7 @@ class HostClock:
         if not self._recent:
             return (low + high) / 2.0 if math.isfinite(low + high) else math.nan
         drift = self._recent[0][1] - self._base
-        return min(max(self._base - SCAN_DELAY, low), high) + drift
+        return min(max(self._base - self.delay, low), high) + drift
 
     def to_host(self, device: float) -> float:
         """Host time of a device time, s; NaN before anything is known."""

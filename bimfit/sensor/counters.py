@@ -14,7 +14,7 @@ class Counters:
     sweeps : int
         Delivered.
     damaged : int
-        Scans that came broken and were not delivered.
+        Scans that came broken, twice, or out of order, and were not delivered.
     missing : int
         Turns that should have come, by the device's own clock, and were not delivered: the damaged ones and
         those of which nothing came. Turns while the device was unplugged are not known and not counted.

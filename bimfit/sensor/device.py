@@ -8,47 +8,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from bimfit.sensor import scip
+from bimfit.sensor.clock import SCAN_PHASE
+from bimfit.sensor.models import UG01, Identity
 from bimfit.sensor.scip import IntArray, Parameters, ScanRequest
 
-# Recorded: a stamp is taken at step 0; plain replies leave 94 ms after it, its scan 101 ms.
-REPLY_PHASE = 0.094
-SCAN_PHASE = 0.101
+REPLY_PHASE = 0.94
+"""Recorded of turns of 100 ms: a stamp is taken at step 0; plain replies leave 94 ms after it."""
 BAUD_RATES = (19200, 38400, 57600, 115200, 250000, 500000, 750000)
-
-
-@dataclass(frozen=True)
-class Identity:
-    """What the device says of itself in answer to VV, PP and II."""
-
-    product: str
-    firmware: str
-    serial: str
-    model: str
-    baud: str
-    vendor: str = "Hokuyo Automatic Co.,Ltd."
-    protocol: str = "SCIP 2.0"
-    speed: str = "Initial(600[rpm])<-Default setting by user"
-    mode: str = "CLASSIC"
-    status: str = "Sensor works well."
-
-
-UG01 = Identity(
-    "SOKUIKI Sensor URG-04LX-UG01(Simple-URG)",
-    "3.4.03(17/Dec./2012)",
-    "H1000001",
-    "URG-04LX-UG01(Simple-URG)",
-    "USB only",
-)
-URG_04LX = Identity(
-    "SOKUIKI Sensor URG-04LX",
-    "3.1.04(02/Aug./2007)",
-    "H0706400",
-    "URG-04LX(Hokuyo Automatic Co.,Ltd.)",
-    "19200[bps]<-Default setting by user",
-)
 
 
 @dataclass(frozen=True)
@@ -63,6 +32,7 @@ class Packet:
 @dataclass
 class _Stream:
     request: ScanRequest
+    line: bytes  # as it was asked for, for the echo
     turn: int  # the next rotation to send
     left: int  # scans left, when counted
 
@@ -104,7 +74,7 @@ class Device:
         self._line = bytearray()
         self._out: list[Packet] = []
         self._stream: _Stream | None = None
-        self._pending: list[tuple[ScanRequest, int]] = []
+        self._pending: list[tuple[ScanRequest, bytes, int]] = []
 
     @property
     def streaming(self) -> bool:
@@ -124,7 +94,7 @@ class Device:
 
     def next_time(self) -> float | None:
         """When the next packet is due; None when nothing is."""
-        times = [packet.time for packet in self._out] + [self._ready(turn) for _, turn in self._pending]
+        times = [packet.time for packet in self._out] + [self._ready(turn) for _, _, turn in self._pending]
         if self._stream is not None:
             times.append(self._ready(self._stream.turn))
         return min(times, default=None)
@@ -133,9 +103,9 @@ class Device:
         """Packets due until ``now``, in order."""
         due = [packet for packet in self._out if packet.time <= now]
         self._out = [packet for packet in self._out if packet.time > now]
-        for request, turn in [item for item in self._pending if self._ready(item[1]) <= now]:
-            due.append(self._scan(request, turn, b"00"))
-        self._pending = [item for item in self._pending if self._ready(item[1]) > now]
+        for request, line, turn in [item for item in self._pending if self._ready(item[2]) <= now]:
+            due.append(self._scan(request, line, turn, b"00"))
+        self._pending = [item for item in self._pending if self._ready(item[2]) > now]
         while self._stream is not None and self._ready(self._stream.turn) <= now:
             due.append(self._stream_scan(self._stream))
         return sorted(due, key=lambda packet: packet.time)
@@ -148,25 +118,32 @@ class Device:
         """The first rotation that starts at ``now`` or later."""
         return -int((-now / self.parameters.period + 1e-9) // 1)
 
+    def _answering(self, now: float) -> int:
+        """The rotation at whose reply phase a request that comes now is looked at."""
+        return self._turn(now - REPLY_PHASE * self.parameters.period)
+
+    def _reply_time(self, now: float) -> float:
+        return (self._answering(now) + REPLY_PHASE) * self.parameters.period
+
     def _ready(self, turn: int) -> float:
-        return turn * self.parameters.period + SCAN_PHASE
+        return (turn + SCAN_PHASE) * self.parameters.period
 
     def _stream_scan(self, stream: _Stream) -> Packet:
-        request = stream.request
+        request, line = stream.request, stream.line
         if request.count:
             stream.left -= 1
-            request = replace(request, count=stream.left)
-        packet = self._scan(request, stream.turn, b"99")
+            line = line[:13] + b"%02d" % stream.left + line[15:]
+        packet = self._scan(request, line, stream.turn, b"99")
         stream.turn += request.interval + 1
         if stream.request.count and not stream.left:
             self._stream, self.laser = None, False
         return packet
 
-    def _scan(self, request: ScanRequest, turn: int, status: bytes) -> Packet:
+    def _scan(self, request: ScanRequest, line: bytes, turn: int, status: bytes) -> Packet:
         start = turn * self.parameters.period
         values = self._values(request, start)
         stamp = self.stamp(start)
-        lines = [request.encode(), scip.with_sum(status), scip.with_sum(scip.encode(stamp, 4))]
+        lines = [line, scip.with_sum(status), scip.with_sum(scip.encode(stamp, 4))]
         body = scip.data_lines(scip.encode_values(values, request.width))
         return Packet(self._ready(turn), b"\n".join(lines) + b"\n" + body + b"\n", stamp)
 
@@ -187,8 +164,7 @@ class Device:
         return np.asarray(np.minimum(values, (1 << (6 * request.width)) - 1), dtype=np.int64)
 
     def _reply(self, line: bytes, status: str, now: float, *lines: bytes) -> None:
-        period = self.parameters.period
-        time = (self._turn(now - REPLY_PHASE)) * period + REPLY_PHASE
+        time = self._reply_time(now)
         body = b"".join(part + b"\n" for part in (line, scip.with_sum(status.encode()), *lines))
         self._out.append(Packet(time, body + b"\n"))
 
@@ -196,7 +172,7 @@ class Device:
         if self._old:
             known = line == b"SCIP2.0"
             self._old = not known
-            time = self._turn(now - REPLY_PHASE) * self.parameters.period + REPLY_PHASE
+            time = self._reply_time(now)
             self._out.append(Packet(time, line + (b"\n0\n\n" if known else b"\nE\n\n")))
             return
         body, mark, string = line.partition(b";")
@@ -229,8 +205,8 @@ class Device:
         self._pending.clear()
         self._reply(line, "00", now)
         if self.late_scan and stream is not None:
-            turn = max(stream.turn, self._turn(self._out[-1].time - REPLY_PHASE))
-            self._out.append(self._scan(stream.request, turn, b"99"))
+            turn = max(stream.turn, self._answering(self._out[-1].time))
+            self._out.append(self._scan(stream.request, stream.line, turn, b"99"))
         if text == "RS":
             self._motor, self._sensitive, self._baud = 0, 0, 19200
             self.clock = -int(now * 1000.0)
@@ -278,18 +254,21 @@ class Device:
 
     def _scan_request(self, line: bytes, text: str, now: float) -> None:
         status = self._check(text)
-        request = ScanRequest.parse(line) if status == "00" else None
+        request = ScanRequest.parse(text.encode("ascii")) if status == "00" else None
         if request is None:
             self._reply(line, status, now)
         elif not request.streams:
             if self.laser:
-                self._pending.append((request, self._turn(now)))
+                # Requests are looked at at the reply phase; the rotation that is then ending is the latest.
+                self._pending.append((request, line, self._answering(now)))
             else:
                 self._reply(line, "10", now)
         else:
             self._reply(line, "00", now)
+            # A rotation that began before the laser was lit cannot be measured.
+            first = self._answering(now) + (not self.laser)
             self.laser = True
-            self._stream = _Stream(request, self._turn(now), request.count)
+            self._stream = _Stream(request, line, first, request.count)
 
     def _check(self, text: str) -> str:
         streams = text[0] == "M"
@@ -315,7 +294,7 @@ class Device:
             names = ("dmin", "dmax", "ares", "amin", "amax", "afrt", "scan")
             known += [(name.upper(), str(getattr(has, name))) for name in names]
         else:
-            time = self._turn(now - REPLY_PHASE) * has.period + REPLY_PHASE
+            time = self._reply_time(now)
             known = [("MODL", it.model), ("LASR", "ON" if self.laser else "OFF"), ("SCSP", it.speed)]
             known += [("MESM", it.mode), ("SBPS", it.baud)]
             known += [("TIME", f"{self.stamp(time):06X}"), ("STAT", it.status)]

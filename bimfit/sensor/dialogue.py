@@ -7,7 +7,7 @@ import struct
 from pathlib import Path
 
 from bimfit.errors import ScanError, SensorError
-from bimfit.sensor.clock import SCAN_DELAY, StampUnwrapper
+from bimfit.sensor.clock import SCAN_PHASE, StampUnwrapper
 from bimfit.sensor.replies import Damaged, ReplyParser, ScanReply, fields
 from bimfit.sensor.scip import Parameters
 from bimfit.sensor.sweep import Sweep
@@ -70,11 +70,9 @@ def read_dialogue(path: str | Path, parameters: Parameters | None = None) -> tup
     for time, data in read_log(path):
         for event in parser.feed(data):
             if isinstance(event, ScanReply):
-                stamp = unwrap(event.stamp) / 1000.0
+                stamp, began = unwrap(event.stamp) / 1000.0, time - SCAN_PHASE * found.period
                 sweeps.append(
-                    Sweep.from_values(
-                        len(sweeps), event.values, event.request, found, stamp, time - SCAN_DELAY
-                    )
+                    Sweep.from_values(len(sweeps), event.values, event.request, found, stamp, began)
                 )
             elif isinstance(event, Damaged):
                 broken += 1

@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 
 from bimfit.errors import ConfigError, SensorError
-from bimfit.sensor.device import UG01, Device, Identity, Packet
+from bimfit.sensor.device import Device, Packet
 from bimfit.sensor.faults import Fault, damage
+from bimfit.sensor.models import UG01, Identity
 from bimfit.sensor.noise import Noise
 from bimfit.sensor.scene import Scene, measurer
 from bimfit.sensor.scip import Parameters
@@ -160,7 +161,7 @@ class Emulator:
         self._out: deque[tuple[float, bytes]] = deque()
         self._silent_until = -math.inf
         self._zero = time.monotonic()
-        self._device = Device(self._measure, self._parameters, **self._options, **self._first)
+        self._device = self._switched_on(**self._first)
         self._plug()
         self.port = str(self._link)
         self._stop.clear()
@@ -185,6 +186,11 @@ class Emulator:
         if self._error is not None:
             error, self._error = self._error, None
             raise SensorError(f"the emulated scene failed: {error}") from error
+
+    def _switched_on(self, **state: Any) -> Device:
+        """A device whose own time is 0 now; what it looks at does not start again."""
+        before = self._boot_at
+        return Device(lambda start: self._measure(before + start), self._parameters, **self._options, **state)
 
     def _plug(self) -> None:
         import pty
@@ -325,7 +331,7 @@ class Emulator:
         self._boot += 1
         self._boot_at = self._now()
         self._silent_until = -math.inf
-        self._device = Device(self._measure, self._parameters, **self._options)
+        self._device = self._switched_on()
         if not self._stop.is_set():
             self._plug()
 

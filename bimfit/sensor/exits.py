@@ -1,4 +1,4 @@
-"""SIGTERM as an exception, so that a laser is switched off on the way out."""
+"""SIGTERM and SIGHUP as exceptions, so that a laser is switched off on the way out."""
 
 from __future__ import annotations
 
@@ -8,19 +8,22 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+"""Signals that ask a process to end: SIGHUP comes when its terminal is closed, and not on Windows."""
+
 
 @contextmanager
 def termination_raises() -> Iterator[None]:
-    """Let SIGTERM raise SystemExit, as Ctrl-C raises KeyboardInterrupt, unless a handler is set already."""
+    """Let them raise SystemExit, as Ctrl-C raises KeyboardInterrupt, unless a handler is set already."""
     main = threading.current_thread() is threading.main_thread()
-    if not main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
-        yield
-        return
-    signal.signal(signal.SIGTERM, _terminate)
+    unset = [number for number in ENDING if main and signal.getsignal(number) is signal.SIG_DFL]
+    for number in unset:
+        signal.signal(number, _terminate)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        for number in unset:
+            signal.signal(number, signal.SIG_DFL)
 
 
 def _terminate(number: int, frame: FrameType | None) -> None:

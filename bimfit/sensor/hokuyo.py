@@ -9,23 +9,23 @@ from collections.abc import Callable, Iterator
 
 from bimfit.errors import SensorError
 from bimfit.sensor import scip
-from bimfit.sensor.clock import HostClock, StampUnwrapper, host_clock
+from bimfit.sensor.clock import SCAN_PHASE, HostClock, StampOrder, StampUnwrapper, host_clock
 from bimfit.sensor.counters import Counters
 from bimfit.sensor.exits import termination_raises
+from bimfit.sensor.guard import Guard
 from bimfit.sensor.line import Line, bound_clock, must_answer, start_up
 from bimfit.sensor.replies import Reply, ScanReply, device_time, fields
+from bimfit.sensor.scanning import begin_stream, next_scan
 from bimfit.sensor.scip import Parameters, ScanRequest
 from bimfit.sensor.serial_port import Unplugged, find_port
 from bimfit.sensor.sweep import Sweep
-
-SILENCE = 1.0  # s without a scan before the device is started anew
 
 
 class Hokuyo:
     """A rangefinder on a serial port; use it as a context manager, so that the laser is off afterwards.
 
-    The laser is switched off when a stream ends, on every way out of the ``with`` block (Ctrl-C and SIGTERM
-    included), and when the interpreter exits.
+    The laser is switched off when a stream ends, on every way out of the ``with`` block (Ctrl-C, SIGTERM and
+    SIGHUP included), and when the interpreter exits; with ``guard`` also when the process is killed.
 
     Parameters
     ----------
@@ -42,6 +42,8 @@ class Hokuyo:
         ``stamp_host``.
     clock : callable, optional
         Host's clock, s.
+    guard : bool
+        Let a second process watch over the port, which switches the laser off when this one is killed.
 
     Attributes
     ----------
@@ -60,6 +62,7 @@ class Hokuyo:
         reconnect: float = 30.0,
         synchronise: bool = True,
         clock: Callable[[], float] | None = None,
+        guard: bool = False,
     ) -> None:
         self._asked_port = port
         self._baud = baud
@@ -67,6 +70,7 @@ class Hokuyo:
         self._reconnect = reconnect
         self._synchronise = synchronise
         self._clock = clock or host_clock()
+        self._guard = Guard() if guard else None
         self._line: Line | None = None
         self._counts = dict.fromkeys(Counters.__dataclass_fields__, 0)
         self._exits = contextlib.ExitStack()
@@ -100,12 +104,13 @@ class Hokuyo:
         line = Line(self._asked_port or find_port(), self._baud, self._clock)
         self._line = line
         atexit.register(self.close)
+        if self._guard is not None:
+            self._guard.start(line.port, self._baud)
         try:
             start_up(line, self._timeout)
             self.version = fields(must_answer(line, b"VV"))
             self.parameters = Parameters.from_fields(fields(must_answer(line, b"PP")))
-            self._unwrap = StampUnwrapper()
-            self._host = HostClock()
+            self._unwrap, self._host = StampUnwrapper(), self._new_clock()
             if self._synchronise:
                 bound_clock(line, self._clock, self._host, self._unwrap)
         except Unplugged as error:
@@ -127,6 +132,8 @@ class Hokuyo:
         finally:
             line.close()
             self._take_counts(line)
+            if self._guard is not None:
+                self._guard.stop()
 
     @property
     def port(self) -> str:
@@ -175,7 +182,7 @@ class Hokuyo:
         """Laser off, any stream ended, clock, motor speed and baud rate as after switching on (RS)."""
         self._streaming = False
         self.query("RS")
-        self._unwrap, self._host = StampUnwrapper(), HostClock()
+        self._unwrap, self._host = StampUnwrapper(), self._new_clock()
 
     def set_motor_speed(self, step: int) -> None:
         """Slow the motor down by 1 to 10 steps, 0 for the default, 99 for a reset (CR)."""
@@ -207,7 +214,7 @@ class Hokuyo:
                 line.scans.clear()
                 line.replies.clear()
                 line.write(request.encode() + b"\n")
-                scan = self._next(line, request)
+                scan = next_scan(line, request, self.parameters.period)
                 if scan is not None:
                     return self._sweep(*scan, index=self._counts["sweeps"])
         except Unplugged as error:
@@ -257,8 +264,10 @@ class Hokuyo:
         try:
             while self._streaming and (count is None or delivered < count):
                 try:
-                    begun = begun or self._begin(request)
-                    scan = self._next(self._open_line(), request) if begun else None
+                    if not begun:
+                        begun = begin_stream(self._open_line(), request)
+                        order = StampOrder(self.parameters.period * (skip + 1))
+                    scan = self._next(request) if begun else None
                 except Unplugged as error:
                     self._counts["unplugged"] += 1
                     self._come_back(error)
@@ -271,6 +280,9 @@ class Hokuyo:
                     self._counts["silent"] += 1
                     self._wake(failures)
                     begun = False
+                    continue
+                if not order.believes(scan[0].stamp):
+                    self._counts["damaged"] += 1
                     continue
                 sweep = self._sweep(*scan, index=delivered)
                 self._count_missing(last, sweep.stamp_device, skip)
@@ -294,43 +306,18 @@ class Hokuyo:
     def _over(self) -> bool:
         return not self._streaming
 
-    def _begin(self, request: ScanRequest) -> bool:
-        """Start the stream; whether the device answers. Raises Unplugged."""
-        line = self._open_line()
-        line.parser.expect = request
-        reply = line.ask_stream(request.encode())
-        if reply is not None and not scip.accepted(reply.name, reply.status):
-            what = scip.meaning(reply.name, reply.status)
-            raise SensorError(f"the rangefinder refuses: {what}", file=line.port)
-        return reply is not None
+    def _next(self, request: ScanRequest) -> tuple[ScanReply, float] | None:
+        return next_scan(self._open_line(), request, self.parameters.period, self._over)
 
-    def _next(self, line: Line, request: ScanRequest) -> tuple[ScanReply, float] | None:
-        """The next scan and its arrival; None after a silence. Raises Unplugged."""
-        deadline = time.monotonic() + max(SILENCE, 5 * self.parameters.period * (request.interval + 1))
-        streams = self._streaming
-        while not line.scans:
-            if time.monotonic() > deadline or (streams and self._over()):
-                return None
-            line.pump()
-            for reply in list(line.replies):
-                if reply.name == request.name and reply.status not in ("00", "98", "99"):
-                    self._refused(line, reply)
-        return line.scans.popleft()
-
-    def _refused(self, line: Line, reply: Reply) -> None:
-        code = int(reply.status) if reply.status.isdigit() else -1
-        if not 21 <= code <= 49:  # those check themselves and go on
-            raise SensorError(
-                f"the rangefinder reports: {scip.meaning(reply.name, reply.status)}", file=line.port
-            )
+    def _new_clock(self) -> HostClock:
+        return HostClock(SCAN_PHASE * self.parameters.period)
 
     def _sweep(self, scan: ScanReply, arrival: float, index: int) -> Sweep:
         stamp = self._unwrap(scan.stamp) / 1000.0
         self._host.observe(stamp, arrival)
         self._counts["sweeps"] += 1
-        return Sweep.from_values(
-            index, scan.values, scan.request, self.parameters, stamp, self._host.to_host(stamp)
-        )
+        began = self._host.to_host(stamp)
+        return Sweep.from_values(index, scan.values, scan.request, self.parameters, stamp, began, arrival)
 
     def _count_missing(self, last: float | None, stamp: float, skip: int) -> None:
         if last is not None:

@@ -1,7 +1,9 @@
 """Bytes from a SCIP device to events, incrementally. No I/O.
 
-Lines end with LF and an empty line ends a reply. Nothing is believed that is not proven: a scan needs a known
-echo, the right number of characters, lines of exactly 64 of them but the last, and every sum.
+Lines end with LF and an empty line ends a reply. Nothing is believed that is not proven, for a sum of six
+bits lets one injury in 64 pass: a scan needs the echo of what was asked, the right number of characters, lines of
+exactly 64 of them but the last, every sum, and ranges that a device can measure. Whether its time stamp goes
+on from the last one's is for :class:`bimfit.sensor.clock.StampOrder` to say.
 """
 
 from __future__ import annotations
@@ -15,6 +17,8 @@ from bimfit.sensor.scip import LINE, IntArray, ScanRequest, checksum, decode, de
 
 MAX_LINE = 160
 MAX_LINES = 2048
+FARTHEST = 0xFFFF
+"""No device of this family sends more, mm, though three characters could."""
 _ECHO_AT_END = re.compile(
     rb"(?:[MG][DS]\d{10}(?:\d{3})?|SCIP2\.0|TM\d|SS\d{6}|CR\d\d|HS\d|VV|PP|II|BM|QT|RS)"
     rb"(?:;[A-Za-z0-9 ._+@]{1,16})?$"
@@ -194,9 +198,12 @@ class ReplyParser:
             raise _Bad("characters missing or too many")
         text = b"".join(_summed(line) for line in data)
         try:
-            return ScanReply(request, decode(_summed(rest[0])), decode_values(text, request.width))
+            stamp, values = decode(_summed(rest[0])), decode_values(text, request.width)
         except ValueError as error:
             raise _Bad("characters out of range") from error
+        if values.max() > FARTHEST:
+            raise _Bad("a range that no device measures")
+        return ScanReply(request, stamp, values)
 
 
 def _status(line: bytes) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -35,6 +36,8 @@ class Sweep:
         The device's clock at step 0, s, unwrapped.
     stamp_host : float
         The same moment on the host's clock, s since 1970.
+    received : float
+        When its last byte was read, on the host's clock, s since 1970; NaN where that is not known.
     """
 
     index: int
@@ -45,6 +48,7 @@ class Sweep:
     delays: FloatArray
     stamp_device: float
     stamp_host: float
+    received: float = math.nan
 
     @classmethod
     def from_values(
@@ -55,6 +59,7 @@ class Sweep:
         parameters: Parameters,
         stamp_device: float,
         stamp_host: float,
+        received: float = math.nan,
     ) -> Sweep:
         """Make it of a scan's values, shape (request.size,)."""
         steps = request.middles
@@ -68,6 +73,7 @@ class Sweep:
             steps / parameters.ares * parameters.period,
             stamp_device,
             stamp_host,
+            received,
         )
 
     @property

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from bimfit.sensor import device as device_module
-from bimfit.sensor.device import UG01, URG_04LX, Device
+from bimfit.sensor.device import Device
+from bimfit.sensor.models import UG01, URG_04LX
 from bimfit.sensor.replies import Reply, ReplyParser, ScanReply, fields
 from bimfit.sensor.scip import Parameters
 
@@ -27,7 +28,7 @@ def test_the_recorded_dialogue_byte_for_byte(dialogue):
     scan = ReplyParser().feed(recording)[-1]
     # The recorded sensor turned a little faster than the host's clock: 8 turns in 798 ms.
     rate, first_reply, origin = 0.8 / 0.798, 10.0, read[0][0]
-    shift = first_reply + device_module.REPLY_PHASE
+    shift = first_reply + 0.1 * device_module.REPLY_PHASE
     turn = round(first_reply * 10) + 9  # the scan's: the ninth after the first reply
     device = Device(lambda _: scan.values, identity=URG_04LX, laser=True, clock=scan.stamp - turn * 100)
     out, sent = b"", []
@@ -153,7 +154,8 @@ def test_an_endless_stream_ends_with_qt():
     device = make()
     device.receive(b"MS0100020002000\n", 0.0)
     events = ReplyParser().feed(b"".join(p.data for p in device.take(1.0)))
-    assert len(events) == 10 and all(event.request.count == 0 for event in events[1:])
+    # Answered in the first turn, which the laser did not light.
+    assert len(events) == 9 and all(event.request.count == 0 for event in events[1:])
     assert events[1].values.tolist() == [1100 + 2 * k for k in range(51)]
     device.receive(b"QT\n", 1.0)
     assert b"".join(p.data for p in device.take(9.0)) == b"QT\n00P\n\n" and not device.laser

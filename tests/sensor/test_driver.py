@@ -13,10 +13,10 @@ import pytest
 
 from bimfit.errors import ConfigError, SensorError
 from bimfit.sensor import serial_port
-from bimfit.sensor.device import URG_04LX
 from bimfit.sensor.emulator import Emulator
 from bimfit.sensor.faults import KINDS, Fault
 from bimfit.sensor.hokuyo import Hokuyo
+from bimfit.sensor.models import URG_04LX
 from bimfit.sensor.noise import NO_NOISE
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="pseudo-terminals")
@@ -297,6 +297,7 @@ def test_the_laser_is_off_on_every_way_out(way):
 PROGRAM = """
 import sys, time
 from bimfit.sensor.hokuyo import Hokuyo
+from bimfit.sensor.models import URG_04LX
 def run(device):
     for sweep in device.scans():
         print("sweep", flush=True)
