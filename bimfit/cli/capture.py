@@ -8,7 +8,7 @@ from pathlib import Path
 
 import typer
 
-from bimfit.cli.interrupts import stoppable
+from bimfit.cli.interrupts import stoppable, undisturbed
 from bimfit.cli.options import angle, read_pose
 from bimfit.cli.options import speed as read_speed
 from bimfit.cli.progress import terminal_progress
@@ -37,6 +37,7 @@ def run(
     ),
 ) -> int:
     """Record a laser rangefinder (SCIP 2.0) until enough or until interrupted."""
+    from bimfit.files import protect_inputs
     from bimfit.pipeline.capture import check_length, check_output, record
     from bimfit.scan.formats import write_scan
 
@@ -44,6 +45,7 @@ def run(
     way = 0.0 if speed is None else read_speed(speed)
     half = None if field is None else angle(field, "--field")
     start = None if pose is None else read_pose(pose)
+    protect_inputs([output], [Path(pose)] if pose is not None and len(pose) < 200 else [])
     check_output(output)
     with stoppable():
         with terminal_progress() as progress:
@@ -53,7 +55,8 @@ def run(
                 progress(f"{count} sweeps", min(count / last, 1.0) if last else 0.0)
 
             made = record(port, sweeps=sweeps, seconds=seconds, field=half, speed=way, pose=start, told=told)
-        write_scan(made.scan, output)
+        with undisturbed():
+            write_scan(made.scan, output)
     lost = f", {made.counters.missing} turns missing" if made.counters.missing else ""
     print(f"{made.sweeps} sweeps, {len(made.scan)} beams{lost}: {output}")
     if made.failure is not None:

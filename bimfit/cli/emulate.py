@@ -6,7 +6,7 @@ import re
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import typer
 
@@ -20,13 +20,16 @@ if TYPE_CHECKING:
     from bimfit.sensor.faults import Fault
 
 SAMPLE = "square-butt-ifc4.ifc"
+LEFT = {"resting": "", "lit": "BM", "timing": "TM0", "streaming": "MD{:04d}{:04d}01000"}
 
 
 def run(
     source: Path | None = typer.Argument(
-        None, metavar="[SCAN|MODEL]", help="A line scan to replay, or a model; default: the packaged sample."
+        None,
+        metavar="[SCAN|MODEL]",
+        help="A line scan or a SCIP dialogue to replay, or a model; default: the packaged sample.",
     ),
-    seed: int = typer.Option(0, "--seed", min=0, help="Of the joint's motion and the noise."),
+    seed: int = typer.Option(0, "--seed", min=0, help="Of the joint's motion, the noise and the faults."),
     joint: str | None = typer.Option(
         None, "--joint", metavar="ID|GUID,GUID", help="Of the model; default: the longest open one."
     ),
@@ -40,32 +43,39 @@ def run(
     truth: Path | None = typer.Option(
         None, "--truth", metavar="FILE", help="Where the truth is written (json)."
     ),
+    device: str = typer.Option(
+        "ug01", "--device", metavar="NAME", help="ug01, urg-04lx, ubg-04lx or utm-30lx."
+    ),
+    left: str = typer.Option(
+        "resting", "--left", metavar="STATE", help="How it was left: resting, lit, timing or streaming."
+    ),
     fault: list[str] = typer.Option(
         [], "--fault", metavar="KIND@S[:S]", help="What goes wrong, when and how long, such as unplug@5:2."
+    ),
+    fault_every: float | None = typer.Option(
+        None, "--fault-every", metavar="S", help="Passing faults of all kinds, so often on average."
     ),
     pace: float = typer.Option(1.0, "--pace", help="Emulated seconds a second."),
     link: Path | None = typer.Option(None, "--link", metavar="PATH", help="Name of the port."),
 ) -> int:
     """Serve a virtual rangefinder on a pseudo-terminal, whose path is the first line, until interrupted."""
-    from bimfit.pipeline.emulate import is_model, recorded_emulation
     from bimfit.sensor.emulator import Emulator
-    from bimfit.sensor.noise import NO_NOISE, Noise
 
     with stoppable():
         try:
-            faults = [_fault(text) for text in fault]
-            spread = None if sigma is None else length(sigma, "--sigma")
-            noise = NO_NOISE if spread == 0.0 else Noise(sigma=spread)
-            if source is None or is_model(source):
-                served = _model(source, scenario, seed, joint, speed, truth)
-            else:
-                _only_for_models(joint, scenario, truth)
-                served = recorded_emulation(source)
+            options = _device(device, left)
+            served = _served(source, scenario, seed, joint, speed, truth, options["parameters"])
             with Emulator(
-                served.scene, speed=pace, noise=noise, faults=faults, seed=seed, link=link
-            ) as device:
-                _announce(device.port, served)
-                while device.running:
+                served.scene,
+                speed=pace,
+                noise=_noise(sigma),
+                faults=_faults(fault, fault_every, seed),
+                seed=seed,
+                link=link,
+                **options,
+            ) as port:
+                _announce(port.port, served)
+                while port.running:
                     time.sleep(0.2)
         except KeyboardInterrupt:
             return 0
@@ -81,33 +91,72 @@ def _announce(port: str, served: Emulation) -> None:
 
         T = served.T_world_sensor
         numbers = [*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_rotvec()]
-        print("starts at --scan-pose " + ",".join(f"{x:.9g}" for x in numbers), file=sys.stderr)
+        text = ",".join(f"{x if abs(x) > 1e-12 else 0.0:.9g}" for x in numbers)
+        print(f"starts at --scan-pose {text}", file=sys.stderr, flush=True)
 
 
-def _model(
-    source: Path | None, scenario: Path | None, seed: int, joint: str | None, speed: str, truth: Path | None
+def _device(name: str, left: str) -> dict[str, Any]:
+    """What the emulator is told of the device."""
+    from bimfit.sensor.models import MODELS
+
+    if name not in MODELS:
+        raise ConfigError(f"--device {name}: unknown", remedy=f"choose from {', '.join(MODELS)}")
+    if left not in LEFT:
+        raise ConfigError(f"--left {left}: unknown", remedy=f"choose from {', '.join(LEFT)}")
+    model = MODELS[name]
+    has = model.parameters
+    request = LEFT[left].format(has.amin, has.amax)
+    waking = "SCIP2.0\n" if model.scip1 and request else ""
+    told = f"{waking}{request}\n".encode("ascii")
+    return {"parameters": has, "identity": model.identity, "scip1": model.scip1, "told": told}
+
+
+def _noise(sigma: str | None) -> Any:
+    from bimfit.sensor.noise import NO_NOISE, Noise
+
+    spread = None if sigma is None else length(sigma, "--sigma")
+    return NO_NOISE if spread == 0.0 else Noise(sigma=spread)
+
+
+def _served(
+    source: Path | None,
+    scenario: Path | None,
+    seed: int,
+    joint: str | None,
+    speed: str,
+    truth: Path | None,
+    parameters: Any,
 ) -> Emulation:
-    from bimfit.files import protect_inputs
-    from bimfit.pipeline.emulate import model_emulation
+    from bimfit.pipeline.emulate import is_model, model_emulation, recorded_emulation
     from bimfit.pipeline.samples import sample_model
     from bimfit.simulation.scenario import Scenario, load_scenario
     from bimfit.simulation.truth import write_truth
 
+    if source is not None and not is_model(source):
+        for name, value in (("--joint", joint), ("--scenario", scenario), ("--truth", truth)):
+            if value is not None:
+                raise ConfigError(f"{name} is for models", remedy="a scan is replayed as it is")
+        return recorded_emulation(source, parameters)
     model = source or sample_model(SAMPLE)
     if truth is not None:
+        from bimfit.files import protect_inputs
+
         protect_inputs([truth], [path for path in (model, scenario) if path is not None])
     settings = load_scenario(scenario) if scenario else Scenario()
-    way = read_speed(speed)
-    served = model_emulation(model, settings, seed, joint=joint, speed=way)
+    served = model_emulation(model, settings, seed, joint=joint, speed=read_speed(speed))
     if truth is not None and served.truth is not None:
         write_truth([served.truth], truth, model=model)
     return served
 
 
-def _only_for_models(joint: str | None, scenario: Path | None, truth: Path | None) -> None:
-    for name, value in (("--joint", joint), ("--scenario", scenario), ("--truth", truth)):
-        if value is not None:
-            raise ConfigError(f"{name} is for models", remedy="a scan is replayed as it is")
+def _faults(texts: list[str], every: float | None, seed: int) -> Any:
+    from bimfit.sensor.faults import now_and_then
+
+    if every is None:
+        return [_fault(text) for text in texts]
+    if texts:
+        raise ConfigError("--fault and --fault-every exclude one another", remedy="give one of them")
+    return now_and_then(every, seed)
 
 
 def _fault(text: str) -> Fault:

@@ -77,7 +77,7 @@ def run(
                 _follow(stream, as_json, sweeps, found)
         except KeyboardInterrupt:
             stopped = True
-    return _conclude(live, found) if found and not stopped else 0
+    return _conclude(live, found, stopped) if found else 0
 
 
 def _follow(
@@ -132,20 +132,21 @@ def _plain(station: LiveStation) -> dict[str, Any]:
         **known,
         "status": station.status.name,
         "reason": station.status.reason,
+        "stamp": None if math.isnan(station.stamp) else station.stamp,
         "latency": None if math.isnan(station.latency) else station.latency,
     }
 
 
-def _conclude(live: Live, found: list[LiveStation]) -> int:
+def _conclude(live: Live, found: list[LiveStation], stopped: bool) -> int:
     late = sorted(s.latency for s in found if not math.isnan(s.latency))
     measured = sum(s.gap is not None for s in found)
     text = f"{measured} of {len(found)} sweeps measured"
     if late:
         half = late[len(late) // 2]
         text += f"; last byte to line {half * 1e3:.0f} ms, at most {late[-1] * 1e3:.0f} ms"
-    missing = live.counters.missing
-    _note(text + (f"; {missing} turns missing" if missing else ""))
-    if measured:
+    lost = {"turns missing": live.counters.missing, "times unplugged": live.counters.unplugged}
+    _note("; ".join([text, *(f"{count} {what}" for what, count in lost.items() if count)]))
+    if measured or stopped:
         return 0
     _note(f"bimfit: joint {live.joint.id} could not be estimated: {found[-1].status.reason}")
     return 1

@@ -5,7 +5,7 @@ It lives here because files, the live sensor and the virtual one all make it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -93,6 +93,19 @@ class LineScan:
         if not len(points):
             return np.full((2, 3), np.nan)
         return np.stack([points.min(axis=0), points.max(axis=0)])
+
+    def split(self) -> Iterator[LineScan]:
+        """Every sweep as a scan of its own, in the order of their numbers."""
+        order = np.argsort(self.scan, kind="stable")
+        for rows in np.split(order, np.flatnonzero(np.diff(self.scan[order])) + 1) if len(order) else ():
+            yield replace(
+                self,
+                scan=self.scan[rows],
+                origins=self.origins[rows],
+                directions=self.directions[rows],
+                ranges=self.ranges[rows],
+                extra={name: column[rows] for name, column in self.extra.items()},
+            )
 
     def transformed(self, T: ArrayLike) -> LineScan:
         """The scan moved by a rigid 4 x 4 matrix, such as T_world_scanner."""

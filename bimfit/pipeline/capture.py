@@ -79,7 +79,7 @@ def record(
     """
     kept: list[Sweep] = []
     interrupted, failure = False, None
-    device = Hokuyo(port)
+    device = Hokuyo(port, guard=True)
     try:
         with device:
             start, end = (None, None) if field is None else device.parameters.steps(-field, field)

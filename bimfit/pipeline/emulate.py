@@ -176,7 +176,7 @@ def model_emulation(
     return Emulation(MovingScene(ride.ranges), about, start, truth)
 
 
-def recorded_emulation(path: Path) -> Emulation:
+def recorded_emulation(path: Path, parameters: Parameters) -> Emulation:
     """The sweeps of a line scan or of a recorded SCIP dialogue, sent as they are, over and over.
 
     Raises
@@ -193,18 +193,29 @@ def recorded_emulation(path: Path) -> Emulation:
         raise ScanError("a point cloud has no sweeps to replay", file=path, remedy="give a line scan")
     if not len(scan):
         raise ScanError("there is no sweep to replay", file=path)
-    scene = _raw_rows(scan) if {"step", "code"} <= set(scan.extra) else scan
+    scene = _raw_rows(scan, parameters) or scan
     return Emulation(scene, f"{len(scan.sweeps)} sweeps of {path.name}")
 
 
-def _raw_rows(scan: LineScan) -> tuple[IntArray, ...]:
-    """What the device sent, exactly: our own recordings know each beam's step."""
-    has = Parameters()
-    steps, codes = (np.asarray(scan.extra[name], float) for name in ("step", "code"))
+def _raw_rows(scan: LineScan, has: Parameters) -> tuple[IntArray, ...]:
+    """What the device sent, exactly, where a recording of our own tells each beam's step and value.
+
+    Empty where it does not, or where its steps are not this device's.
+    """
+    if not {"step", "code"} <= set(scan.extra):
+        return ()
     rows = []
-    for number in scan.sweeps:
-        use = (scan.scan == number) & (steps >= has.amin) & (steps <= has.amax) & (codes >= 0)
+    turn = 2.0 * math.pi / has.ares
+    for sweep in scan.split():
+        steps, codes = (np.asarray(sweep.extra[name], float) for name in ("step", "code"))
+        if not (np.isfinite(steps).all() and np.isfinite(codes).all() and (codes >= 0).all()):
+            return ()
+        between = np.arccos(np.clip(np.sum(sweep.directions[1:] * sweep.directions[:-1], axis=1), -1.0, 1.0))
+        if np.any(steps < has.amin) or np.any(steps > has.amax):
+            return ()
+        if np.any(np.abs(between - np.diff(steps) * turn) > 0.1 * turn):
+            return ()
         row = np.zeros(has.amax - has.amin + 1, dtype=np.int64)
-        row[np.rint(steps[use]).astype(np.int64) - has.amin] = codes[use].astype(np.int64)
+        row[np.rint(steps).astype(np.int64) - has.amin] = codes.astype(np.int64)
         rows.append(row)
     return tuple(rows)

@@ -49,6 +49,9 @@ RECENT = 20
 """So many sweeps say what the sensor's noise is."""
 SWEEPS = 1000
 """So many sweeps are prepared for: building the faster look-up tables pays."""
+MOST_WAITING = 3
+"""With more sweeps waiting than that, the older ones are left out."""
+_SKIPPED = Status("no_data", "left out: this computer does not keep up")
 _STEP = 0.01
 _PROFILES = 0.02
 """Distance at which a joint's profile is looked at beforehand, m."""
@@ -67,6 +70,8 @@ class LiveStation:
     status : Status
     gap : GapSection or None
         None where it could not be measured.
+    stamp : float
+        The device's clock at the sweep's start, s; NaN of a recording.
     latency : float
         From the sweep's last byte to here, s; NaN of a recording.
     """
@@ -75,6 +80,7 @@ class LiveStation:
     s: float
     status: Status
     gap: GapSection | None = None
+    stamp: float = math.nan
     latency: float = math.nan
 
 
@@ -266,13 +272,14 @@ class Live:
             raise ScanError(f"the scan does not show joint {self._chosen.id}", file=path)
         ready = LiveFit(self.model, self._chosen.facing(eye), self._config)
         ready.prepare(self._mount.height)
-        for number, sweep in _sweeps(scan):
-            yield ready.fit_placed(number, sweep)
+        for sweep in scan.split():
+            yield ready.fit_placed(int(sweep.scan[0]), sweep)
 
     def _replay_carried(self, scan: LineScan) -> Iterator[LiveStation]:
-        place = self._ready(ask="a recording in the sensor's coordinates")
-        for number, sweep in _sweeps(scan):
-            station = place(number, sweep, np.asarray(sweep.extra["time"], float))
+        self._insist_on_speed("a recording in the sensor's coordinates")
+        place = self._ready()
+        for sweep in scan.split():
+            station = place(int(sweep.scan[0]), sweep, np.asarray(sweep.extra["time"], float))
             if station is None:
                 return
             yield station
@@ -298,30 +305,38 @@ class Live:
         SensorError
             When the device cannot be reached, or is gone for good.
         """
-        place = self._ready(ask="a sensor")
+        self._insist_on_speed("a sensor")
         clock = host_clock()
-        device = Hokuyo(port, clock=clock)
+        device = Hokuyo(port, clock=clock, guard=True)
         try:
             with device:
                 steps = device.parameters.steps(-field, field)
+                place = self._ready()
                 told()
                 with closing(device.scans(*steps, count=sweeps)) as stream:  # type: ignore[type-var]
                     for sweep in stream:
+                        if device.waiting > MOST_WAITING:
+                            yield LiveStation(sweep.index, math.nan, _SKIPPED)
+                            continue
                         station = place(sweep.index, line_scan([sweep]), sweep.times)
                         if station is None:
                             return
-                        yield dataclasses.replace(station, latency=clock() - sweep.received)
+                        yield dataclasses.replace(
+                            station, stamp=sweep.stamp_device, latency=clock() - sweep.received
+                        )
         finally:
             self.counters = device.counters
 
-    def _ready(self, ask: str) -> Callable[[int, LineScan, Array], LiveStation | None]:
+    def _insist_on_speed(self, source: str) -> None:
+        if self._mount.speed is None:
+            raise ConfigError(
+                f"{source} does not say how fast it moves", remedy="--speed 0.05 (m/s), 0 where it stands"
+            )
+
+    def _ready(self) -> Callable[[int, LineScan, Array], LiveStation | None]:
         """Prepare; what it returns places a sweep in the sensor's coordinates and fits it, or ends."""
         mount = self._mount
-        if mount.speed is None:
-            raise ConfigError(
-                f"{ask} does not say how fast it moves", remedy="--speed 0.05 (m/s), 0 where it stands"
-            )
-        speed = mount.speed
+        speed = mount.speed or 0.0
         ready = LiveFit(self.model, self._facing(), self._config)
         ready.prepare(mount.height)
         first: list[float] = []  # when the first sweep looked ahead
@@ -359,22 +374,3 @@ class Live:
         if mount.flip:
             joint = dataclasses.replace(joint, path=joint.path.flipped(), legs=joint.legs[::-1])
         return joint
-
-
-def _sweeps(scan: LineScan) -> Iterator[tuple[int, LineScan]]:
-    """Every sweep as a scan of its own."""
-    order = np.argsort(scan.scan, kind="stable")
-    for number, rows in zip(
-        scan.sweeps.tolist(), np.split(order, np.flatnonzero(np.diff(scan.scan[order])) + 1), strict=True
-    ):
-        yield (
-            number,
-            LineScan(
-                scan.scan[rows],
-                scan.origins[rows],
-                scan.directions[rows],
-                scan.ranges[rows],
-                scan.source,
-                extra={name: column[rows] for name, column in scan.extra.items()},
-            ),
-        )

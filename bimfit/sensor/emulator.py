@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
 import select
@@ -10,7 +9,7 @@ import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,7 @@ from bimfit.sensor.scip import Parameters
 
 USB_RATE = 0.93e6  # recorded: 2134 bytes in 2.3 ms
 PIECE = 512
+KEPT = 100_000
 
 
 @dataclass(frozen=True)
@@ -62,14 +62,17 @@ class Emulator:
         Emulated seconds a second; infinity sends as fast as the other side reads.
     noise : Noise, optional
         Defaults to noise as recorded.
-    faults : sequence of Fault
-        What goes wrong, and when.
+    faults : iterable of Fault
+        What goes wrong, and when. An iterator has them in the order of their times and may be endless; what
+        was due while nobody asked for scans is left out.
     parameters, identity : Parameters, Identity
         What the device is.
     scip1, laser, late_scan, clock
         See :class:`~bimfit.sensor.device.Device`.
     wait : float
         Seconds of emulated time before it answers at all, as after switching on.
+    told : bytes
+        Requests that it was sent before anyone opens the port: how another program left it.
     seed : int
         Of the noise and the faults.
     link : path, optional
@@ -80,8 +83,11 @@ class Emulator:
     ----------
     port : str
         What to open.
-    log : list of Sent
-        Every scan, in order.
+    log : deque of Sent
+        The last scans, in order; about three hours of them.
+    departures : deque of (int, int, float)
+        Boot and stamp of scans that left whole, and when their last byte was handed to the system, s of
+        ``time.monotonic()``.
     """
 
     def __init__(
@@ -90,7 +96,7 @@ class Emulator:
         *,
         speed: float = 1.0,
         noise: Noise | None = None,
-        faults: Sequence[Fault] = (),
+        faults: Iterable[Fault] = (),
         parameters: Parameters | None = None,
         identity: Identity = UG01,
         scip1: bool = False,
@@ -98,6 +104,7 @@ class Emulator:
         late_scan: bool = False,
         clock: int = 0,
         wait: float = 0.0,
+        told: bytes = b"",
         seed: int = 0,
         link: str | Path | None = None,
     ) -> None:
@@ -107,9 +114,12 @@ class Emulator:
         self._parameters = parameters or Parameters()
         self._measure = measurer(scene, self._parameters, noise or Noise(), self._rng)
         self._speed = speed
-        self._faults = deque(sorted(faults, key=lambda fault: fault.at))
+        listed = isinstance(faults, Sequence)
+        self._overdue = math.inf if listed else 1.0
+        self._faults = iter(sorted(faults, key=lambda fault: fault.at) if listed else faults)
+        self._fault = next(self._faults, None)
         self._options: dict[str, Any] = {"identity": identity, "scip1": scip1, "late_scan": late_scan}
-        self._wait = wait
+        self._wait, self._told = wait, told
         self._first: dict[str, Any] = {"laser": laser, "clock": clock}
         self._link = Path(link) if link is not None else None
         self._folder: tempfile.TemporaryDirectory[str] | None = None
@@ -117,7 +127,8 @@ class Emulator:
         self._stop = threading.Event()
         self._error: BaseException | None = None
         self.port = ""
-        self.log: list[Sent] = []
+        self.log: deque[Sent] = deque(maxlen=KEPT)
+        self.departures: deque[tuple[int, int, float]] = deque(maxlen=KEPT)
 
     def __enter__(self) -> Emulator:
         self.start()
@@ -158,10 +169,12 @@ class Emulator:
             self._folder = tempfile.TemporaryDirectory(prefix="bimfit-")
             self._link = Path(self._folder.name) / "ttyUG01"
         self._boot, self._boot_at, self._shift = 0, 0.0, 0.0
-        self._out: deque[tuple[float, bytes]] = deque()
+        self._out: deque[tuple[float, bytes, int | None]] = deque()
         self._silent_until = -math.inf
+        self._begun = math.nan
         self._zero = time.monotonic()
         self._device = self._switched_on(**self._first)
+        self._device.receive(self._told, 0.0)
         self._plug()
         self.port = str(self._link)
         self._stop.clear()
@@ -206,7 +219,8 @@ class Emulator:
             self._link.symlink_to(os.ttyname(self._slave))
         except OSError as error:
             self._close()
-            raise SensorError(f"cannot be made: {error.strerror}", file=self._link) from error
+            remedy = "remove it, or choose another name" if self._link.is_symlink() else "choose another name"
+            raise SensorError(f"cannot be made: {error.strerror}", file=self._link, remedy=remedy) from error
         self._plugged = True
 
     def _close(self) -> None:
@@ -277,12 +291,17 @@ class Emulator:
             # The host does not take what was sent; the device has no room for another scan.
             self._note(stamp, "overrun")
             return
-        fault = self._faults[0] if self._faults and stamp is not None and self._faults[0].at <= now else None
-        if fault is None:
-            self._queue(packet.data, now)
+        if stamp is not None and math.isnan(self._begun):
+            self._begun = now
+        since = now - self._begun
+        while self._fault is not None and self._fault.at < since - self._overdue:
+            self._fault = next(self._faults, None)
+        fault = self._fault
+        if fault is None or stamp is None or fault.at > since:
+            self._queue(packet.data, now, stamp)
             self._note(stamp, "")
             return
-        self._faults.popleft()
+        self._fault = next(self._faults, None)
         if fault.kind == "silence":
             self._silent_until = now + fault.length
             self._note(stamp, "silence")
@@ -297,27 +316,31 @@ class Emulator:
         if stamp is not None:
             self.log.append(Sent(stamp, self._boot, fault))
 
-    def _queue(self, data: bytes, now: float) -> None:
+    def _queue(self, data: bytes, now: float, stamp: int | None = None) -> None:
+        """Let bytes leave at the pace of USB; ``stamp`` notes when the last of them does."""
         if self._speed > 4.0:
-            self._out.append((now, data))
+            self._out.append((now, data, stamp))
             return
         for k in range(0, len(data), PIECE):
-            self._out.append((now + (k + PIECE) / USB_RATE, data[k : k + PIECE]))
+            last = stamp if k + PIECE >= len(data) else None
+            self._out.append((now + (k + PIECE) / USB_RATE, data[k : k + PIECE], last))
 
     def _write(self, now: float) -> None:
         while self._out and self._out[0][0] <= now:
-            due, data = self._out[0]
-            with contextlib.suppress(BlockingIOError):
+            due, data, stamp = self._out[0]
+            try:
                 done = os.write(self._master, data)
-                self._out.popleft()
-                if done < len(data):
-                    self._out.appendleft((due, data[done:]))
-                continue
-            return
+            except BlockingIOError:
+                return
+            self._out.popleft()
+            if done < len(data):
+                self._out.appendleft((due, data[done:], stamp))
+            elif stamp is not None:
+                self.departures.append((self._boot, stamp, time.monotonic()))
 
     def _pull_out(self, half: bytes, length: float) -> None:
         """Let the host read what was sent so far, and the cable is out; later the device starts anew."""
-        self._out.append((-math.inf, half))
+        self._out.append((-math.inf, half, None))
         start = seen = time.monotonic()
         # Bytes pass through a buffer of the kernel that cannot be asked, hence some quiet time at the end.
         while time.monotonic() < min(seen + 0.05, start + 5.0) and not self._stop.is_set():

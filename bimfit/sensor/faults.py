@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -23,6 +24,8 @@ Kind = Literal[
     "hardware",
 ]
 KINDS: tuple[Kind, ...] = get_args(Kind)
+PASSING: tuple[Kind, ...] = tuple(kind for kind in KINDS if kind != "hardware")
+"""What a device recovers from by itself."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,7 @@ class Fault:
     Attributes
     ----------
     at : float
-        When, s of emulated time since the emulator started; the next scan sent is hit.
+        When, s of emulated time since the first scan was sent; the next one after that is hit.
     kind : str
         ``bad_sum``, ``flipped_byte``, ``dropped_byte``, ``doubled_byte``, ``truncated`` damage that scan;
         ``garbage`` puts noise ahead of it and leaves it whole; ``silence`` swallows everything for
@@ -52,6 +55,21 @@ class Fault:
             raise ConfigError(f"unknown fault {self.kind!r}", remedy="use one of " + ", ".join(KINDS))
         if not (self.at >= 0.0 and self.length >= 0.0):
             raise ConfigError("a fault's time and length are at least 0")
+
+
+def now_and_then(every: float, seed: int) -> Iterator[Fault]:
+    """Passing faults of all kinds without end, ``every`` seconds on average."""
+    if not 0.0 < every < np.inf:
+        raise ConfigError(f"faults every {every:g} s: must be more than 0")
+    return _without_end(every, seed)
+
+
+def _without_end(every: float, seed: int) -> Iterator[Fault]:
+    rng = np.random.default_rng(seed)
+    at = 0.0
+    while True:
+        at += float(rng.uniform(0.5, 1.5)) * every
+        yield Fault(at, PASSING[int(rng.integers(len(PASSING)))], float(rng.uniform(0.1, 0.9)))
 
 
 def damage(scan: bytes, kind: Kind, rng: np.random.Generator) -> bytes:

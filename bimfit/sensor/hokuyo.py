@@ -141,6 +141,11 @@ class Hokuyo:
         return self._open_line().port
 
     @property
+    def waiting(self) -> int:
+        """Scans of a stream that have come and are not yet taken."""
+        return len(self._line.scans) if self._line is not None else 0
+
+    @property
     def counters(self) -> Counters:
         """What has happened so far."""
         counts = dict(self._counts)

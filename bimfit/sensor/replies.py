@@ -1,9 +1,9 @@
 """Bytes from a SCIP device to events, incrementally. No I/O.
 
 Lines end with LF and an empty line ends a reply. Nothing is believed that is not proven, for a sum of six
-bits lets one injury in 64 pass: a scan needs the echo of what was asked, the right number of characters, lines of
-exactly 64 of them but the last, every sum, and ranges that a device can measure. Whether its time stamp goes
-on from the last one's is for :class:`bimfit.sensor.clock.StampOrder` to say.
+bits lets one injury in 64 pass: a scan needs the echo of what was asked, the right number of characters,
+lines of exactly 64 of them but the last, every sum, and ranges that a device can measure. Whether its time
+stamp goes on from the last one's is for :class:`bimfit.sensor.clock.StampOrder` to say.
 """
 
 from __future__ import annotations

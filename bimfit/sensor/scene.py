@@ -67,28 +67,39 @@ def measurer(
 
 def _from_line_scan(scan: LineScan, parameters: Parameters) -> list[IntArray]:
     rows = []
-    for number in scan.sweeps:
-        chosen = scan.scan == number
-        directions, ranges = scan.directions[chosen], scan.ranges[chosen]
-        mm = np.rint(np.nan_to_num(ranges, nan=0.0) * 1000.0).astype(np.int64)
+    for sweep in scan.split():
+        directions = sweep.directions
+        mm = np.rint(np.nan_to_num(sweep.ranges, nan=0.0) * 1000.0).astype(np.int64)
         # Our own recordings know the codes of what is missing.
-        missing = np.asarray(scan.extra["code"])[chosen].astype(np.int64) if "code" in scan.extra else 0
-        ahead = directions[len(directions) // 2]
-        # Beams are numbered counter-clockwise seen from above, so the first one looks to the right.
-        up = np.cross(directions[0], directions[-1])
-        if np.linalg.norm(np.cross(directions[0], ahead)) > 1e-9:
-            up = np.cross(directions[0], ahead)
-        if np.linalg.norm(up) < 1e-9:
-            up = np.cross(ahead, np.eye(3)[int(np.argmin(np.abs(ahead)))])
-        left = np.cross(up / np.linalg.norm(up), ahead)
-        bearings = np.arctan2(directions @ left, directions @ ahead)
-        steps = np.rint(bearings / (2.0 * np.pi) * parameters.ares).astype(np.int64) + parameters.afrt
+        missing = _column(sweep, "code").astype(np.int64) if "code" in sweep.extra else 0
+        steps = np.rint(_bearings(directions) / (2.0 * np.pi) * parameters.ares).astype(np.int64)
+        steps += parameters.afrt
         values = np.where((mm >= parameters.dmin) & (mm <= parameters.dmax), mm, missing)
         row = np.zeros(parameters.amax - parameters.amin + 1, dtype=np.int64)
         inside = (steps >= parameters.amin) & (steps <= parameters.amax)
         row[steps[inside] - parameters.amin] = values[inside]
         rows.append(row)
     return rows
+
+
+def _bearings(directions: FloatArray) -> FloatArray:
+    """Bearings of a sweep's beams (n, 3), rad, the middle one ahead.
+
+    Beams are numbered counter-clockwise seen from above, so the first one looks to the right.
+    """
+    ahead = directions[len(directions) // 2]
+    up = np.cross(directions[0], directions[-1])
+    if np.linalg.norm(np.cross(directions[0], ahead)) > 1e-9:
+        up = np.cross(directions[0], ahead)
+    if np.linalg.norm(up) < 1e-9:
+        up = np.cross(ahead, np.eye(3)[int(np.argmin(np.abs(ahead)))])
+    left = np.cross(up / np.linalg.norm(up), ahead)
+    return np.asarray(np.arctan2(directions @ left, directions @ ahead))
+
+
+def _column(sweep: LineScan, name: str) -> FloatArray:
+    """A further column as numbers; what is none of a sensor's values becomes 0."""
+    return np.nan_to_num(np.asarray(sweep.extra[name], dtype=np.float64), posinf=0.0, neginf=0.0)
 
 
 def _values(item: Sweep | IntArray, parameters: Parameters) -> IntArray:

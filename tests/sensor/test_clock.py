@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bimfit.sensor.clock import HostClock, StampUnwrapper, host_clock
+from bimfit.sensor.clock import HostClock, StampOrder, StampUnwrapper, host_clock
 
 
 @given(st.integers(0, (1 << 24) - 1), st.lists(st.integers(0, (1 << 23) - 1), max_size=50))
@@ -59,3 +59,30 @@ def test_the_host_clock_is_time_and_monotonic():
     clock = host_clock()
     assert abs(clock() - time.time()) < 0.5
     assert clock() <= clock()
+
+
+@given(
+    st.integers(0, (1 << 24) - 1),
+    st.lists(st.tuples(st.integers(1, 20), st.integers(-3, 3)), min_size=1, max_size=40),
+)
+def test_stamps_of_a_healthy_stream_are_all_believed(start, steps):
+    """Whole turns of 100 ms that jitter, some left out, over the wrap."""
+    order, at = StampOrder(0.1), start
+    assert order.believes(start)
+    for turns, jitter in steps:
+        at += 100 * turns + jitter
+        assert order.believes(at % (1 << 24))
+
+
+def test_what_comes_twice_late_or_from_nowhere_is_doubted_once():
+    order = StampOrder(0.1)
+    told = [1000, 1100, 1100, 1200, 1100, 1300, 9_000_000, 1400, 1500]
+    assert [order.believes(stamp) for stamp in told] == [
+        True, True, False, True, False, True, False, True, True,
+    ]  # fmt: skip
+
+
+def test_a_clock_that_was_set_is_followed():
+    order = StampOrder(0.1)
+    told = [5_000_000, 5_000_100, 50, 150, 250, 40_000_00, 4_000_100]
+    assert [order.believes(stamp) for stamp in told] == [True, True, False, True, True, False, True]

@@ -96,7 +96,7 @@ def test_the_last_line_may_hold_a_single_character():
 )
 def test_scans_of_any_layout(name, size, cluster, stamp, random):
     request = ScanRequest(name, 10, 10 + size - 1, cluster)
-    values = [random.randrange(64**request.width) for _ in range(request.size)]
+    values = [random.randrange(min(64**request.width, 1 << 16)) for _ in range(request.size)]
     status = b"99" if request.streams else b"00"
     data = scan_bytes(request.encode(), stamp, values, request.width, status)
     (scan,) = ReplyParser(request).feed(data)
@@ -149,6 +149,13 @@ def test_only_what_was_asked_for_is_believed():
         assert isinstance(event, Damaged) and event.scan, echo
     (event,) = ReplyParser(request).feed(scan_bytes(b"MD0010002002002", 1, values))
     assert isinstance(event, ScanReply)
+
+
+def test_a_range_that_no_device_measures_is_damage():
+    request = ScanRequest("MD", 0, 3)
+    for farthest, believed in ((65535, True), (65536, False)):
+        (event,) = ReplyParser(request).feed(scan_bytes(request.encode(), 1, [100, farthest, 0, 7]))
+        assert isinstance(event, ScanReply) is believed
 
 
 def test_a_lost_line_end_costs_one_reply_and_not_two():
