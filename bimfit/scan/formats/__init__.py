@@ -34,6 +34,7 @@ from bimfit.geometry.line_scan import LineScan
 from bimfit.scan.cloud import PointCloud
 from bimfit.scan.formats.carmen import looks_like_carmen, read_carmen
 from bimfit.scan.formats.delimited import read_csv, write_csv
+from bimfit.scan.formats.e57 import e57_chunks, read_e57
 from bimfit.scan.formats.hokuyo_logs import looks_like_breezy, looks_like_ubh, read_breezy, read_ubh
 from bimfit.scan.formats.las import las_chunks, read_las
 from bimfit.scan.formats.npz import read_npz, write_npz
@@ -102,6 +103,7 @@ FORMATS: tuple[Format, ...] = (
     Format("PLY", (".ply",), _plain(read_ply), write_ply, (b"ply\n", b"ply\r\n")),
     Format("PCD", (".pcd",), _plain(read_pcd), write_pcd, (b"# .PCD", b"VERSION 0.7", b"VERSION .7")),
     Format("LAS", (".las", ".laz"), _plain(read_las), None, (b"LASF",), chunks=las_chunks),
+    Format("E57", (".e57",), read_e57, None, (b"ASTM-E57",), chunks=e57_chunks),
     Format("PTX", (".ptx",), _plain(read_ptx)),
     Format("CARMEN log", (".clf",), _plain(read_carmen), looks=looks_like_carmen),
     Format("UBH", (".ubh",), _plain(read_ubh), looks=looks_like_ubh, unit=1e-3),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from bimfit.geometry.line_scan import LineScan
 from bimfit.geometry.pose import Array
 from bimfit.scan.formats.packed import precision_note
 
-_PLANAR = math.radians(0.3)
+PLANAR = math.radians(0.3)
 """Beams of a sweep lie in a plane to within this (rms)."""
 _WIDEST_HOLE = math.radians(40.0)
 """Empty places between returns farther apart than this get no direction."""
@@ -39,14 +40,44 @@ def beams_of(grid: Array, viewpoint: Array, source: str, dtype: np.dtype[np.gene
     LineScan or None
         None where neither rows nor columns are sweeps, so that the viewpoint cannot be right.
     """
-    rows, columns = _planarity(grid, viewpoint), _planarity(grid.transpose(1, 0, 2), viewpoint)
-    if not min(rows, columns) <= _PLANAR:
+    rows, columns = planarity(grid, viewpoint), planarity(grid.transpose(1, 0, 2), viewpoint)
+    if not min(rows, columns) <= PLANAR:
         return None
     # both are planes for a camera: rows, as they are stored
-    sweeps = grid if rows <= _PLANAR else grid.transpose(1, 0, 2)
-    numbers, ways, ranges = [], [], []
+    sweeps = grid if rows <= PLANAR else grid.transpose(1, 0, 2)
+    scan, unknown = swept(sweeps, viewpoint, source)
+    if not len(scan):
+        return None
+    missing = int((~scan.returned).sum())
+    which = "rows" if rows <= PLANAR else "columns"
+    notes = (
+        f"organised cloud: its {which} are sweeps seen from its viewpoint, {missing} beams without return",
+        *((f"{unknown} empty places at the ends of sweeps left out",) if unknown else ()),
+        *precision_note(scan.hits, dtype),
+    )
+    return replace(scan, notes=notes)
+
+
+def swept(sweeps: Array, viewpoint: Array, source: str, first: int = 0) -> tuple[LineScan, int]:
+    """Beams of sweeps as seen from one place.
+
+    Parameters
+    ----------
+    sweeps : ndarray, shape (sweeps, places, 3)
+        Points, NaN where nothing came back, m.
+    viewpoint : ndarray, shape (3,)
+    first : int
+        Number of the first sweep.
+
+    Returns
+    -------
+    scan : LineScan
+    unknown : int
+        How many empty places beyond a sweep's outermost returns were left out.
+    """
+    numbers, ways, ranges = [np.zeros(0, np.int64)], [np.zeros((0, 3))], [np.zeros(0)]
     unknown = 0
-    for number, sweep in enumerate(sweeps):
+    for number, sweep in enumerate(sweeps, start=first):
         way, distance = _filled(sweep - viewpoint)
         known = np.isfinite(way).all(axis=1)
         unknown += int((~known).sum())
@@ -54,26 +85,11 @@ def beams_of(grid: Array, viewpoint: Array, source: str, dtype: np.dtype[np.gene
         ways.append(way[known])
         ranges.append(distance[known])
     directions = np.concatenate(ways)
-    if not len(directions):
-        return None
-    scan = LineScan.of(
-        np.concatenate(numbers),
-        np.broadcast_to(viewpoint, directions.shape),
-        directions,
-        np.concatenate(ranges),
-        source,
-    )
-    missing = int((~scan.returned).sum())
-    which = "rows" if rows <= _PLANAR else "columns"
-    notes = (
-        f"organised cloud: its {which} are sweeps seen from its viewpoint, {missing} beams without return",
-        *((f"{unknown} empty places at the ends of sweeps left out",) if unknown else ()),
-        *precision_note(scan.hits, dtype),
-    )
-    return LineScan(scan.scan, scan.origins, scan.directions, scan.ranges, source, notes)
+    origins = np.broadcast_to(viewpoint, directions.shape)
+    return LineScan.of(np.concatenate(numbers), origins, directions, np.concatenate(ranges), source), unknown
 
 
-def _planarity(sweeps: Array, viewpoint: Array) -> float:
+def planarity(sweeps: Array, viewpoint: Array) -> float:
     """Typical rms angle of beams out of their sweep's plane, rad; inf where nothing can be said."""
     out = []
     for k in np.unique(np.linspace(0, len(sweeps) - 1, _SAMPLE).astype(int)):
