@@ -4,7 +4,8 @@ A file may be larger than memory. :func:`scan_chunks` gives a scan in pieces, an
 near some places says so by ``ReadOptions.boxes``. A format takes part by ``chunks`` beside ``read``::
 
     def las_chunks(path: Path, options: ReadOptions) -> Iterator[PointCloud]: ...
-    Format("LAS", (".las", ".laz"), _plain(read_las), None, (b"LASF",), chunks=las_chunks)
+    Format("COPC", (), read_las, looks=looks_like_copc, chunks=copc_chunks),
+    Format("LAS", (".las", ".laz"), read_las, None, (b"LASF",), chunks=las_chunks)
 
 - It yields ``PointCloud`` (or ``LineScan``) pieces in the file's order and unit, float64, of about a million
   points, never holding more than a piece or two; what it cannot read is an error as for ``read``, at the
@@ -33,6 +34,7 @@ from bimfit.files import whole_file
 from bimfit.geometry.line_scan import LineScan
 from bimfit.scan.cloud import PointCloud
 from bimfit.scan.formats.carmen import looks_like_carmen, read_carmen
+from bimfit.scan.formats.copc import copc_chunks, looks_like_copc
 from bimfit.scan.formats.delimited import read_csv, write_csv
 from bimfit.scan.formats.e57 import e57_chunks, read_e57
 from bimfit.scan.formats.hokuyo_logs import looks_like_breezy, looks_like_ubh, read_breezy, read_ubh
@@ -102,7 +104,8 @@ FORMATS: tuple[Format, ...] = (
     Format("NPZ", (".npz",), _plain(read_npz), write_npz, (b"PK\x03\x04",), beams=True),
     Format("PLY", (".ply",), _plain(read_ply), write_ply, (b"ply\n", b"ply\r\n")),
     Format("PCD", (".pcd",), _plain(read_pcd), write_pcd, (b"# .PCD", b"VERSION 0.7", b"VERSION .7")),
-    Format("LAS", (".las", ".laz"), _plain(read_las), None, (b"LASF",), chunks=las_chunks),
+    Format("COPC", (), read_las, looks=looks_like_copc, chunks=copc_chunks),
+    Format("LAS", (".las", ".laz"), read_las, None, (b"LASF",), chunks=las_chunks),
     Format("E57", (".e57",), read_e57, None, (b"ASTM-E57",), chunks=e57_chunks),
     Format("PTX", (".ptx",), _plain(read_ptx)),
     Format("CARMEN log", (".clf",), _plain(read_carmen), looks=looks_like_carmen),
@@ -234,10 +237,10 @@ def format_of(path: Path, head: bytes) -> Format:
         When it is none that is known.
     """
     for form in FORMATS:
-        if any(head.startswith(magic) for magic in form.magic):
+        if form.looks is not None and form.looks(head):
             return form
     for form in FORMATS:
-        if form.looks is not None and form.looks(head):
+        if any(head.startswith(magic) for magic in form.magic):
             return form
     suffix = path.suffix.lower()
     for form in FORMATS:

@@ -239,7 +239,9 @@ def _pieces(path: Path, lib: ModuleType, image: Any, scan: _Scan, size: int = 0)
     size = size or PIECE
     # a longlong: what NumPy calls int64 on Linux is a C long, of which pye57 fills 32 bits
     whole = {invalid, *_LINES, *_COLORS}
-    room = {name: np.zeros(size, np.longlong if name in whole else np.float64) for name in names}
+    room: dict[str, NDArray[Any]] = {
+        name: np.zeros(size, np.longlong if name in whole else np.float64) for name in names
+    }
     buffers = lib.VectorSourceDestBuffer()
     for name in names:
         buffers.append(lib.SourceDestBuffer(image, name, room[name], size, True, True))
@@ -249,7 +251,7 @@ def _pieces(path: Path, lib: ModuleType, image: Any, scan: _Scan, size: int = 0)
         while count := int(reader.read()):
             seen += count
             columns = {name: values[:count].copy() for name, values in room.items()}
-            points = np.stack([columns.pop(name) for name in own], axis=1)
+            points: Array = np.stack([columns.pop(name) for name in own], axis=1)
             if scan.spherical:
                 points = _cartesian(points)
             nothing = ~usable(points) | (points == 0.0).all(axis=1)

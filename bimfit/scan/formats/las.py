@@ -16,11 +16,13 @@ from bimfit.geometry.pose import Array
 from bimfit.scan.boxes import Boxes
 from bimfit.scan.cloud import PointCloud, usable
 from bimfit.scan.formats.options import ANY, ReadOptions
+from bimfit.scan.formats.packed import COARSE
+from bimfit.scan.formats.text import first_lines
 
 _CHUNK = 500_000
 
 
-def read_las(path: Path) -> PointCloud:
+def read_las(path: Path, options: ReadOptions = ANY) -> PointCloud:
     """Read a LAS or LAZ file; its integers and scale give float64 coordinates without loss.
 
     Raises
@@ -28,7 +30,7 @@ def read_las(path: Path) -> PointCloud:
     ScanError
         When it is no such file, is cut short, holds no point, or laspy is not installed.
     """
-    pieces = list(las_chunks(path, ANY))
+    pieces = list(las_chunks(path, replace(options, boxes=None)))
     return replace(
         pieces[0],
         points=np.concatenate([piece.points for piece in pieces]),
@@ -53,14 +55,14 @@ def las_chunks(path: Path, options: ReadOptions) -> Iterator[PointCloud]:
     wanted = options.file_boxes(1.0)
     boxes = None if wanted is None else Boxes.of(wanted)
     seen = good = 0
-    with _named_errors(path), laspy.open(path) as reader:
+    check_records(path)
+    with las_errors(path), laspy.open(path) as reader:
         header = reader.header
         scale, offset = np.asarray(header.scales, float), np.asarray(header.offsets, float)
-        step = float(np.max(np.abs(scale)))
-        notes = (f"coordinates are stored in steps of {step:g} units",) if step > 5e-4 else ()
+        notes = step_note(scale, options)
         for chunk in reader.chunk_iterator(_CHUNK):
             seen += len(chunk)
-            piece = _piece(path, chunk, scale, offset, boxes, notes)
+            piece = las_piece(path, chunk, scale, offset, boxes, notes)
             good += len(chunk) if boxes is not None else len(piece)
             yield piece
         count = int(header.point_count)
@@ -70,9 +72,34 @@ def las_chunks(path: Path, options: ReadOptions) -> Iterator[PointCloud]:
         raise ScanError("the file holds no point", file=path)
 
 
-def _piece(
+def check_records(path: Path) -> None:
+    """Refuse a header that promises more records than the file has room for; laspy would read on and on.
+
+    Raises
+    ------
+    ScanError
+        When there are too many.
+    """
+    head = first_lines(path, 375)
+    if len(head) < 227:
+        raise ScanError("not a LAS file, or cut short", file=path)
+    (records,) = struct.unpack_from("<I", head, 100)
+    further = struct.unpack_from("<I", head, 243)[0] if head[24:26] == b"\x01\x04" and len(head) >= 247 else 0
+    if records * 54 + further * 60 > path.stat().st_size:
+        raise ScanError("not a LAS file, or damaged: more records than it has room for", file=path)
+
+
+def step_note(scale: Array, options: ReadOptions) -> tuple[str, ...]:
+    """A note where the steps in which coordinates are stored, (3,) in the file's unit, do not hold 0.1 mm."""
+    step = float(np.max(np.abs(scale)))
+    coarse = 0.5 * step * (options.unit or 1.0) > COARSE * (1.0 + 1e-9)
+    return (f"coordinates are stored in steps of {step:g} units",) if coarse else ()
+
+
+def las_piece(
     path: Path, chunk: Any, scale: Array, offset: Array, boxes: Boxes | None, notes: tuple[str, ...]
 ) -> PointCloud:
+    """Some of the file's points as laspy has them; those outside the boxes never become floats."""
     if boxes is not None:
         raw = chunk.array
         chunk = chunk[boxes.find(raw["X"], raw["Y"], raw["Z"], scale, offset)[0]]
@@ -85,7 +112,7 @@ def _piece(
 
 
 @contextmanager
-def _named_errors(path: Path) -> Iterator[None]:
+def las_errors(path: Path) -> Iterator[None]:
     """Turn what laspy raises on damaged files into one clear line."""
     import laspy
 
@@ -98,6 +125,7 @@ def _named_errors(path: Path) -> Iterator[None]:
         TypeError,
         RuntimeError,
         OverflowError,
+        IndexError,
         MemoryError,
         struct.error,
         laspy.LaspyException,
