@@ -71,12 +71,34 @@ class AsBuiltGap:
     mesh: TriangleMesh | None = None
 
 
+@dataclass(frozen=True)
+class MovedElement:
+    """How far an element is from its design.
+
+    Attributes
+    ----------
+    motion : array_like, shape (4, 4)
+        World motion, m: as built = motion * designed.
+    stations : int or None
+        How many stations it rests on.
+    rms : float or None
+        How far these are from a rigid motion, m.
+    undetermined : int or None
+        How many of the six directions of motion the scan says nothing about.
+    """
+
+    motion: ArrayLike
+    stations: int | None = None
+    rms: float | None = None
+    undetermined: int | None = None
+
+
 def write_as_built(
     model: str | Path,
     gaps: Sequence[AsBuiltGap],
     output: str | Path,
     *,
-    moved: Mapping[str, ArrayLike] | None = None,
+    moved: Mapping[str, MovedElement | ArrayLike] | None = None,
 ) -> Path:
     """Write the model with what was found: every gap an IfcVirtualElement, components moved if asked.
 
@@ -92,9 +114,10 @@ def write_as_built(
     gaps : sequence of AsBuiltGap
     output : path
         The ``.ifc`` to write, whole or not at all.
-    moved : mapping of str to array_like (4, 4), optional
+    moved : mapping of str to MovedElement or array_like (4, 4), optional
         GlobalId -> world motion (m) that carries the designed element to where it is: its placement is moved,
-        openings and parts with it, and the deviation is noted in a property set.
+        parts, openings and what fills them with it, and the deviation is noted in a property set. Nothing
+        else moves, whatever its placement is relative to.
 
     Returns
     -------
@@ -113,8 +136,7 @@ def write_as_built(
     writer = IfcWriter(open_ifc(model), "bimfit as-built")
     for gap in gaps:
         _add_gap(writer, gap, Path(model))
-    for guid, motion in sorted((moved or {}).items()):
-        _move(writer, _element(writer, guid, Path(model)), np.asarray(motion, float))
+    _move_all(writer, moved or {}, Path(model))
     with whole_file(target) as part:
         try:
             writer.file.write(str(part))
@@ -183,26 +205,43 @@ def _add_gap(writer: IfcWriter, gap: AsBuiltGap, path: Path) -> None:
     writer.add_quantities(element, GAP_QUANTITIES, quantities)
 
 
-def _move(writer: IfcWriter, element: Any, motion: Array) -> None:
-    """Move an element's placement by a world motion (4, 4) and note the deviation."""
-    if motion.shape != (4, 4) or not np.all(np.isfinite(motion)):
-        raise ExportError(f"the motion of {element.GlobalId} is not a finite 4 x 4 matrix")
-    if element.ObjectPlacement is None:
-        raise ExportError(f"element {element.GlobalId} has no placement that could be moved")
+def _move_all(writer: IfcWriter, moved: Mapping[str, MovedElement | ArrayLike], path: Path) -> None:
+    """Move elements by their world motions and note the deviations."""
+    motions: dict[Any, Array] = {}
+    for guid, given in sorted(moved.items()):
+        element = _element(writer, guid, path)
+        about = given if isinstance(given, MovedElement) else MovedElement(given)
+        motion = np.asarray(about.motion, float)
+        if motion.shape != (4, 4) or not np.all(np.isfinite(motion)):
+            raise ExportError(f"the motion of {guid} is not a finite 4 x 4 matrix")
+        movable = writer.has_local_placement(element)
+        if movable:
+            motions[element] = motion
+        _note_deviation(writer, element, about, motion, movable)
+    writer.move(motions)
+
+
+def _note_deviation(
+    writer: IfcWriter, element: Any, about: MovedElement, motion: Array, movable: bool
+) -> None:
     # The shift of the element's own origin says more than that of the world's, which may be far away.
-    before = writer.world_placement(element)
-    writer.set_world_placement(element, motion @ before)
+    before = writer.world_placement(element) if movable else np.eye(4)
     shift = (motion @ before - before)[:3, 3]
     turn = math.atan2(
         float(np.linalg.norm(_axial(motion[:3, :3]))), 0.5 * (float(np.trace(motion[:3, :3])) - 1.0)
     )
     properties = {
+        "Moved": ("IfcBoolean", movable),
+        "Reason": ("IfcText", None if movable else "its placement is not a local one, and was left"),
         **{
             f"Shift{axis}": ("IfcLengthMeasure", writer.length(float(d)))
             for axis, d in zip("XYZ", shift, strict=True)
         },
         "Distance": ("IfcLengthMeasure", writer.length(float(np.linalg.norm(shift)))),
         "Rotation": ("IfcPlaneAngleMeasure", writer.angle(turn)),
+        "Stations": ("IfcInteger", about.stations),
+        "ResidualRms": ("IfcLengthMeasure", writer.length(about.rms)),
+        "UndeterminedDirections": ("IfcInteger", about.undetermined),
     }
     writer.add_properties(element, DEVIATION_SET, properties)
 

@@ -108,6 +108,10 @@ class IfcWriter:
             RelatingStructure=container,
         )
 
+    def has_local_placement(self, product: Any) -> bool:
+        """Whether a product is placed by axes, which can be moved, and so is all that it is placed under."""
+        return bool(_chain(product)) and all(place.is_a("IfcLocalPlacement") for place in _chain(product))
+
     def world_placement(self, product: Any) -> Array:
         """A product's placement as a matrix (4, 4), m."""
         import ifcopenshell.util.placement as placements
@@ -116,22 +120,41 @@ class IfcWriter:
         matrix[:3, 3] /= self._metre
         return matrix
 
-    def set_world_placement(self, product: Any, matrix: Array) -> None:
-        """Place a product (4, 4), m; what is placed relative to it comes along."""
+    def move(self, motions: Mapping[Any, Array]) -> None:
+        """Move products by world motions (4, 4), m, with all that belongs to them, and nothing else.
+
+        Parts, openings and what fills openings go along, however their own placements are written; what is
+        merely placed relative to a moved product stays where it is.
+        """
+        carried = dict(motions)
+        for product, motion in motions.items():
+            for other in _belongings(product):
+                carried.setdefault(other, motion)
+        places = {product.ObjectPlacement for product in carried if product.ObjectPlacement is not None}
+        wanted: list[tuple[int, int, Any, Array]] = []
+        for product in self.file.by_type("IfcProduct") if motions else ():
+            chain = _chain(product)
+            if not self.has_local_placement(product) or not (
+                product in carried or any(place in places for place in chain)
+            ):
+                continue
+            motion = carried.get(product, np.eye(4))
+            wanted.append((len(chain), product.id(), product, motion @ self.world_placement(product)))
+        # parents first: what they carry along is put right after them
+        for _, _, product, matrix in sorted(wanted, key=lambda row: row[:2]):
+            if not np.allclose(self.world_placement(product), matrix, rtol=0.0, atol=1e-9):
+                self._set_world_placement(product, matrix)
+
+    def _set_world_placement(self, product: Any, matrix: Array) -> None:
+        """Place a product (4, 4), m; what is placed relative to it comes along, unless others share it."""
         placement = product.ObjectPlacement
-        parent = getattr(placement, "PlacementRelTo", None)
-        local = self._relative(parent, matrix)
-        if placement.is_a("IfcLocalPlacement") and len(placement.PlacesObject) <= 1:
-            placement.RelativePlacement = local  # its dependants refer to it, and so follow
+        local = self._relative(placement.PlacementRelTo, matrix)
+        if len(placement.PlacesObject) <= 1:
+            placement.RelativePlacement = local
             return
-        made = self.file.create_entity("IfcLocalPlacement", parent, local)
-        product.ObjectPlacement = made
-        for relation in getattr(product, "HasOpenings", ()):
-            opening = relation.RelatedOpeningElement
-            if opening.ObjectPlacement == placement:
-                opening.ObjectPlacement = made
-            elif getattr(opening.ObjectPlacement, "PlacementRelTo", None) == placement:
-                opening.ObjectPlacement.PlacementRelTo = made
+        product.ObjectPlacement = self.file.create_entity(
+            "IfcLocalPlacement", placement.PlacementRelTo, local
+        )
 
     def _relative(self, parent: Any, matrix: Array) -> Any:
         """The axes that put a world matrix (4, 4), m, under a parent placement."""
@@ -237,6 +260,31 @@ class IfcWriter:
             RelatedObjects=[product],
             RelatingPropertyDefinition=definition,
         )
+
+
+def _chain(product: Any) -> list[Any]:
+    """A product's placement and those that it is relative to, its own first."""
+    found: list[Any] = []
+    place = product.ObjectPlacement
+    while place is not None and place not in found:
+        found.append(place)
+        place = getattr(place, "PlacementRelTo", None)
+    return found
+
+
+def _belongings(product: Any) -> list[Any]:
+    """Parts, openings and what fills them, all the way down."""
+    found: list[Any] = []
+    waiting = [product]
+    while waiting:
+        one = waiting.pop()
+        parts = [p for r in getattr(one, "IsDecomposedBy", ()) for p in r.RelatedObjects]
+        holes = [r.RelatedOpeningElement for r in getattr(one, "HasOpenings", ())]
+        fills = [r.RelatedBuildingElement for r in getattr(one, "HasFillings", ())]
+        fresh = [p for p in (*parts, *holes, *fills) if p not in found and p.is_a("IfcProduct")]
+        found += fresh
+        waiting += fresh
+    return found
 
 
 def _scale(file: Any, kind: str) -> float:

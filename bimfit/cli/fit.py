@@ -54,6 +54,9 @@ def run(
     config: Path | None = typer.Option(None, "--config", metavar="FILE.toml", help="Settings."),
     pictures: bool = typer.Option(True, help="Draw pictures."),
     as_built: bool = typer.Option(True, help="Write the model with the gaps as as-built.ifc."),
+    move_elements: bool = typer.Option(
+        False, "--move-elements", help="In as-built.ifc, put components where they are."
+    ),
     limits: str | None = typer.Option(None, "--limits", metavar="LIMITS", help=LIMITS_HELP),
     bcf: Path | None = typer.Option(
         None, "--bcf", metavar="FILE", help="Write joints that break the limits or were not measured there."
@@ -73,6 +76,7 @@ def run(
     wanted = Deliverables(
         pictures=pictures,
         as_built=as_built,
+        move_elements=move_elements,
         limits=Limits() if limits is None else read_limits(limits),
         bcf=bcf,
         bcf_version=bcf_version,  # type: ignore[arg-type]  # checked below

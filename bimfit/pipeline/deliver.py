@@ -84,7 +84,7 @@ def deliver(
     notes += [note] if note else []
     if wanted.as_built:
         progress("writing the as-built model", 0.0)
-        written, notes_of_model = try_write_model(survey, folder)
+        written, notes_of_model = try_write_model(survey, folder, move_elements=wanted.move_elements)
         files += [written] if written else []
         notes += notes_of_model
     if wanted.pictures:
