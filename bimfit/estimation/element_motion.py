@@ -98,7 +98,7 @@ def element_motion(seen: Sequence[Seen]) -> ElementMotion:
 
     def off(x: Array) -> Array:
         T = _matrix(basis @ x)
-        return np.array([frame.drop(T).as_array() for frame in frames]) - poses
+        return np.asarray(np.array([frame.drop(T).as_array() for frame in frames]) - poses)
 
     def residual(x: Array) -> Array:
         return np.asarray(np.hstack([np.linalg.solve(L, d) for L, d in zip(roots, off(x), strict=True)]))
