@@ -20,6 +20,7 @@ from bimfit.geometry.pose import Array
 from bimfit.geometry.slice import Slice
 from bimfit.pipeline.accuracy import joint_errors
 from bimfit.pipeline.fit import METHODS, check_choice, fit_joint
+from bimfit.pipeline.placing import Placing, place_scan
 from bimfit.pipeline.records import JointResult
 from bimfit.pipeline.results import to_json
 from bimfit.report.tables import MethodOutcome, plot_comparison
@@ -104,6 +105,7 @@ def compare(
     truth: Path | None = None,
     joints: Selection | Sequence[str] = (),
     scan_pose: Array | None = None,
+    placing: Placing | None = None,
     progress: Progress = lambda step, share: None,
 ) -> Comparison:
     """Fit the joints that a scan shows with every method.
@@ -114,7 +116,7 @@ def compare(
         For an input that cannot be used, or a method that does not exist.
     """
     from bimfit.bim.selection import Selection
-    from bimfit.pipeline.survey import covered_joints, cut_joint, load_scan, model_joints
+    from bimfit.pipeline.survey import covered_joints, cut_joint, model_joints, part_of
 
     check_methods(methods)
     truths = read_truth(truth) if truth is not None else ()
@@ -122,9 +124,10 @@ def compare(
     if truths and not wanted.named:
         wanted = dataclasses.replace(wanted, names=tuple(",".join(one.elements) for one in truths))
     model, found = model_joints(model_path, config.joints, wanted)
-    scan = load_scan(scan_path, scan_pose)
+    scan = place_scan(scan_path, model, found, config, placing or Placing(scan_pose)).nearby
     cuts = [
-        cut_joint(model, joint, scan, config) for joint in covered_joints(found, scan, asked=wanted.named)
+        cut_joint(model, joint, part_of(scan, joint, config), config)
+        for joint in covered_joints(found, scan, config, asked=wanted.named)
     ]
     cuts = [cut for cut in cuts if cut[1]]
     if not cuts:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.pose import Array, Pose2D
@@ -134,11 +134,13 @@ class SurveyResult:
         The files.
     building : Model
     cloud : LineScan or PointCloud
-        What was read from them, in world coordinates.
+        What was read from them, in world coordinates; of a point cloud what lies near the joints.
     config : Config
     joints : tuple of JointResult
     notes : tuple of str
         What a user should know of how the files were read.
+    placing : mapping
+        How the scan was carried to the model's coordinates, in plain values.
     """
 
     model: Path
@@ -148,6 +150,7 @@ class SurveyResult:
     config: Config
     joints: tuple[JointResult, ...]
     notes: tuple[str, ...] = ()
+    placing: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def failed(self) -> Sequence[JointResult]:

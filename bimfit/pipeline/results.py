@@ -41,6 +41,7 @@ def survey_to_dict(survey: SurveyResult, meshes: Mapping[str, Mapping[str, Any]]
         "scan": str(survey.scan),
         "units": {"length": "m", "angle": "rad"},
         "notes": list(survey.notes),
+        "placing": dict(survey.placing),
         "joints": [_joint(joint, survey.building, meshes.get(joint.joint.id, {})) for joint in survey.joints],
     }
 

@@ -20,23 +20,23 @@ from bimfit.geometry.pose import Array
 from bimfit.geometry.slice import Slice
 from bimfit.pipeline.fit import check_choice, fit_joint
 from bimfit.pipeline.listing import model_joints as model_joints
+from bimfit.pipeline.placing import NEAR, Placing, joint_boxes, place_scan
 from bimfit.pipeline.records import JointResult, SurveyResult
 from bimfit.pipeline.shown import share_shown
 from bimfit.pipeline.targets import match_reach, with_assumed_view
 from bimfit.scan.cloud import PointCloud
 from bimfit.scan.coverage import covers, scan_stations
+from bimfit.scan.nearby import Nearby
 from bimfit.scan.slicing import cut_slices
 
 if TYPE_CHECKING:
     from bimfit.bim.joint import Joint
-    from bimfit.bim.model import Model
     from bimfit.bim.selection import Selection
 
 Scan = LineScan | PointCloud
 Cut: TypeAlias = "tuple[Joint, tuple[JointSection, ...], tuple[Slice, ...]]"
 LEAST_COVER = 0.3
 """A joint that was not asked for by name is fitted where the scan shows at least this share of it."""
-NEAR = 0.3
 LEAST_SHOWN = 0.7
 """... and where both of its components show themselves at this share of the stations."""
 Progress = Callable[[str, float], None]
@@ -55,6 +55,7 @@ def survey(
     method: str = "grcsm",
     motion: str = "auto",
     scan_pose: Array | None = None,
+    placing: Placing | None = None,
     progress: Progress = silent,
 ) -> SurveyResult:
     """Fit every joint that is asked for, or every joint that the scan shows.
@@ -71,7 +72,9 @@ def survey(
     motion : str
         Motion model along the joint.
     scan_pose : ndarray, shape (4, 4), optional
-        T_world_scanner of a scan in scanner coordinates.
+        T_world_scanner of a scan in scanner coordinates; short for ``Placing(pose=...)``.
+    placing : Placing, optional
+        How the scan is read and where it lies.
     progress : callable
         Told (step, share done).
 
@@ -84,18 +87,19 @@ def survey(
     progress("reading the model", 0.0)
     model, found = model_joints(model_path, config.joints, joints)
     progress("reading the scan", 0.0)
-    scan = load_scan(scan_path, scan_pose)
     asked = by_name(joints)
-    chosen = covered_joints(found, scan, asked=asked)
+    placed = place_scan(scan_path, model, found, config, placing or Placing(scan_pose))
+    chosen = covered_joints(found, placed.nearby, config, asked=asked)
     if not chosen:
+        one = "the joint that was asked for" if asked else "enough of any joint"
         raise ScanError(
-            _far_message(model, scan, asked),
+            f"the scan does not show {one}",
             file=scan_path,
             remedy="check its units and its frame; --scan-pose places a scan that is in scanner coordinates",
         )
     results: list[JointResult] = []
     progress("cutting the joints", 0.0)
-    cuts = [cut_joint(model, joint, scan, config) for joint in chosen]
+    cuts = [cut_joint(model, joint, part_of(placed.nearby, joint, config), config) for joint in chosen]
     cuts, partly = (cuts, "") if asked else fully_shown(cuts, config)
     for k, (facing, sections, slices) in enumerate(cuts):
         step = f"joint {facing.id} ({k + 1} of {len(cuts)})"
@@ -110,9 +114,11 @@ def survey(
                 progress=partial(progress, step),
             )
         )
-    said = (*model.notes, *model.left_out(most=3), *scan.notes)
+    said = (*model.notes, *model.left_out(most=3), *placed.notes)
     notes = (*said, *([partly] if partly else []))
-    return SurveyResult(model_path, scan_path, model, scan, config, tuple(results), notes)
+    return SurveyResult(
+        model_path, scan_path, model, placed.nearby.scan, config, tuple(results), notes, placed.to_dict()
+    )
 
 
 def by_name(joints: Selection | Sequence[str]) -> bool:
@@ -134,10 +140,22 @@ def load_scan(path: Path, pose: Array | None = None) -> Scan:
     return scan if pose is None else scan.transformed(pose)
 
 
-def covered_joints(joints: Sequence[Joint], scan: Scan, *, asked: bool) -> list[Joint]:
+def covered_joints(
+    joints: Sequence[Joint], scan: Scan | Nearby, config: Config, *, asked: bool
+) -> list[Joint]:
     """Joints that the scan shows: any of their length where they were asked for, else a good part of it."""
     least = 0.0 if asked else LEAST_COVER
-    return [joint for joint in joints if max(covers(scan, path, NEAR) for path in mouth_paths(joint)) > least]
+    chosen = []
+    for joint in joints:
+        part = part_of(scan, joint, config)
+        if max(covers(part, path, NEAR) for path in mouth_paths(joint)) > least:
+            chosen.append(joint)
+    return chosen
+
+
+def part_of(scan: Scan | Nearby, joint: Joint, config: Config) -> Scan:
+    """What of a scan matters to a joint."""
+    return scan.around(joint_boxes(joint, config)) if isinstance(scan, Nearby) else scan
 
 
 def fully_shown(cuts: Sequence[Cut], config: Config) -> tuple[list[Cut], str]:
@@ -214,18 +232,3 @@ def viewpoint_of(scan: Scan, joint: Joint) -> Array | None:
         if near.any():
             return np.asarray(scan.origins[near].mean(axis=0))
     return None
-
-
-def _far_message(model: Model, scan: Scan, asked: bool) -> str:
-    low, high = model.bounds
-    bounds = scan.bounds
-    if not np.all(np.isfinite(bounds)):
-        return "the scan holds no return"
-    apart = float(np.linalg.norm(np.maximum(0.0, np.maximum(low - bounds[1], bounds[0] - high))))
-    if apart > NEAR:
-        return f"the scan is far from the model: {apart:.3g} m lie between them"
-    return (
-        "the scan does not show the joint that was asked for"
-        if asked
-        else "the scan shows none of the joints"
-    )

@@ -40,7 +40,7 @@ from bimfit.scan.formats.e57 import e57_chunks, read_e57
 from bimfit.scan.formats.hokuyo_logs import looks_like_breezy, looks_like_ubh, read_breezy, read_ubh
 from bimfit.scan.formats.las import las_chunks, read_las
 from bimfit.scan.formats.npz import read_npz, write_npz
-from bimfit.scan.formats.options import ANY, ReadOptions
+from bimfit.scan.formats.options import ANY, ReadOptions, unit_name
 from bimfit.scan.formats.packing import GZIP, unpacked
 from bimfit.scan.formats.pcd import read_pcd, write_pcd
 from bimfit.scan.formats.pictures import looks_like_sick, read_npy, read_png, read_sick, read_tiff
@@ -169,8 +169,10 @@ def scan_chunks(path: str | Path, options: ReadOptions = ANY) -> Iterator[Scan]:
     """
     with _opened(Path(path)) as (form, inner):
         read = form.chunks or (lambda path, options: iter((form.read(path, options),)))
+        said = f"{form.name}, in {unit_name(options.unit or form.unit)}"
         for piece in read(inner, options):
-            yield _in_metres(piece, form, options, Path(path))
+            scan = _in_metres(piece, form, options, Path(path))
+            yield replace(scan, notes=(*scan.notes, said))
 
 
 @contextmanager
