@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import inspect
 import math
 import re
 from collections.abc import Callable
@@ -13,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from bimfit.cli.options import length
+from bimfit.cli.sharing import shared_options
 from bimfit.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -81,30 +80,7 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {
 
 def choosing(command: Callable[..., int]) -> Callable[..., int]:
     """Give a command the options that choose joints, as one argument ``choice`` (a Selection)."""
-    own = inspect.signature(command)
-    # the choice's own type is only there for the type checker
-    kinds = {name: kind for name, kind in command.__annotations__.items() if name not in ("choice", "return")}
-    known = {name: eval(kind, command.__globals__) for name, kind in kinds.items()}
-
-    @functools.wraps(command)
-    def run(**values: Any) -> int:
-        picked = {name: values.pop(name) for name in _OPTIONS}
-        return command(choice=selection(**picked), **values)
-
-    added = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
-        for name, (kind, default) in _OPTIONS.items()
-    ]
-    kept = [
-        parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=known[name])
-        for name, parameter in own.parameters.items()
-        if name != "choice"
-    ]
-    signature = own.replace(parameters=[*kept, *added], return_annotation=int)
-    run.__signature__ = signature  # type: ignore[attr-defined]
-    run.__annotations__ = {p.name: p.annotation for p in signature.parameters.values()} | {"return": int}
-    del run.__wrapped__  # typer would look through it
-    return run
+    return shared_options(command, "choice", _OPTIONS, selection)
 
 
 def selection(

@@ -8,16 +8,20 @@ from typing import TYPE_CHECKING
 import typer
 
 from bimfit.cli.choosing import choosing
-from bimfit.cli.options import build_config, read_pose
+from bimfit.cli.options import build_config
+from bimfit.cli.placing import placing
 from bimfit.cli.progress import terminal_progress
 
 if TYPE_CHECKING:
     from bimfit.bim.selection import Selection
+    from bimfit.pipeline.placing import Placing
 
 
 @choosing
+@placing
 def run(
     choice: Selection,
+    where: Placing,
     model: Path = typer.Argument(..., metavar="MODEL.ifc", help="The building model."),
     scan: Path = typer.Argument(..., metavar="SCAN", help="Line scan or point cloud."),
     output: Path = typer.Option(
@@ -30,9 +34,6 @@ def run(
         None, "--truth", metavar="FILE", help="Truth to measure errors against."
     ),
     spacing: str | None = typer.Option(None, "--spacing", help="Distance between stations, such as 10mm."),
-    scan_pose: str | None = typer.Option(
-        None, "--scan-pose", metavar="POSE|FILE", help="Scanner pose in the model."
-    ),
     config: Path | None = typer.Option(None, "--config", metavar="FILE.toml", help="Settings."),
 ) -> int:
     """Run the same slices through every method and compare error, time and failures."""
@@ -45,7 +46,6 @@ def run(
         else tuple(name.strip() for name in methods.split(",") if name.strip())
     )
     settings = build_config(config, spacing=spacing)
-    pose = None if scan_pose is None else read_pose(scan_pose)
     check_folder(output)
     with terminal_progress() as progress:
         result = compare(
@@ -55,7 +55,7 @@ def run(
             methods=names,
             truth=truth,
             joints=choice,
-            scan_pose=pose,
+            placing=where,
             progress=progress,
         )
         write_comparison(result, output)

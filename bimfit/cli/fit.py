@@ -11,16 +11,20 @@ import typer
 from bimfit.cli.choosing import choosing
 from bimfit.cli.limits import HELP as LIMITS_HELP
 from bimfit.cli.limits import read_limits
-from bimfit.cli.options import build_config, read_pose
+from bimfit.cli.options import build_config
+from bimfit.cli.placing import placing
 from bimfit.cli.progress import terminal_progress
 
 if TYPE_CHECKING:
     from bimfit.bim.selection import Selection
+    from bimfit.pipeline.placing import Placing
 
 
 @choosing
+@placing
 def run(
     choice: Selection,
+    where: Placing,
     model: Path = typer.Argument(..., metavar="MODEL.ifc", help="The building model."),
     scan: Path = typer.Argument(
         ..., metavar="SCAN", help="Line scan (csv, npz) or point cloud (ply, pcd, xyz, ...)."
@@ -45,12 +49,6 @@ def run(
         None, "--thickness", help="Thickness of a cloud's slices, such as 10mm."
     ),
     sigma: str | None = typer.Option(None, "--sigma", help="The sensor's range noise, such as 3mm."),
-    scan_pose: str | None = typer.Option(
-        None,
-        "--scan-pose",
-        metavar="POSE|FILE",
-        help="Scanner pose in the model: x,y,z,rx,ry,rz (m, rad) or a file of 16 numbers.",
-    ),
     config: Path | None = typer.Option(None, "--config", metavar="FILE.toml", help="Settings."),
     pictures: bool = typer.Option(True, help="Draw pictures."),
     as_built: bool = typer.Option(True, help="Write the model with the gaps as as-built.ifc."),
@@ -72,7 +70,6 @@ def run(
     settings = build_config(
         config, window=window, tolerance=tolerance, spacing=spacing, thickness=thickness, sigma=sigma
     )
-    pose = None if scan_pose is None else read_pose(scan_pose)
     wanted = Deliverables(
         pictures=pictures,
         as_built=as_built,
@@ -91,7 +88,7 @@ def run(
             joints=choice,
             method=method,
             motion=motion,
-            scan_pose=pose,
+            placing=where,
             progress=progress,
         )
         _, said = deliver(result, output, wanted, progress)

@@ -116,6 +116,21 @@ class LineScan:
             directions=np.asarray(self.directions @ m[:3, :3].T),
         )
 
+    def laid_out(self, poses: Array) -> LineScan:
+        """A scan in a moving sensor's own coordinates, laid out in the world by one pose a beam.
+
+        Parameters
+        ----------
+        poses : ndarray, shape (n, 4, 4)
+            T_world_sensor while each beam was measured.
+        """
+        turns = poses[:, :3, :3]
+        return replace(
+            self,
+            origins=np.einsum("nij,nj->ni", turns, self.origins) + poses[:, :3, 3],
+            directions=np.einsum("nij,nj->ni", turns, self.directions),
+        )
+
 
 def joined(scans: Sequence[LineScan], source: str = "") -> LineScan:
     """One scan out of several, the sweeps numbered on from one to the next, starting at 0."""

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from bimfit.geometry.joint_section import JointSection
-from bimfit.geometry.line_scan import LineScan
 from bimfit.geometry.pose import Array
 from bimfit.simulation.rangefinder import aim
 
@@ -32,13 +29,3 @@ def advanced(T_world_sensor: Array, distances: Array) -> Array:
     poses = np.repeat(T_world_sensor[None], len(distances), axis=0)
     poses[:, :3, 3] += np.asarray(distances)[:, None] * T_world_sensor[:3, 2]
     return poses
-
-
-def carried(scan: LineScan, poses: Array) -> LineScan:
-    """A scan in the sensor's own coordinates, laid out in the world by one pose (n, 4, 4) a beam."""
-    turns = poses[:, :3, :3]
-    return replace(
-        scan,
-        origins=np.einsum("nij,nj->ni", turns, scan.origins) + poses[:, :3, 3],
-        directions=np.einsum("nij,nj->ni", turns, scan.directions),
-    )

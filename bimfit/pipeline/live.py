@@ -24,7 +24,7 @@ from bimfit.geometry.line_scan import LineScan
 from bimfit.geometry.pose import Array
 from bimfit.geometry.slice import Slice
 from bimfit.geometry.status import Status
-from bimfit.pipeline.carriage import advanced, carried, held_over
+from bimfit.pipeline.carriage import advanced, held_over
 from bimfit.pipeline.fit import fit_station
 from bimfit.pipeline.simulate import designed, longest_open
 from bimfit.pipeline.survey import load_scan, model_joints, mouth_paths, viewpoint_of
@@ -348,7 +348,7 @@ class Live:
             # each beam has its own time; the section is where the sensor was when it looked ahead
             way = speed * (times - first[0])
             if mount.pose is not None:
-                return ready.fit_placed(index, carried(sweep, advanced(mount.pose, way)))
+                return ready.fit_placed(index, sweep.laid_out(advanced(mount.pose, way)))
             middle = float(way[ahead])
             s = mount.start + middle
             if (s > length and speed > 0.0) or (s < 0.0 and speed < 0.0):
@@ -358,7 +358,7 @@ class Live:
                 reason = "the design shows no gap there" if 0.0 <= s <= length else "outside the joint"
                 return LiveStation(index, s, Status("no_data", reason))
             return ready.fit(
-                index, section, carried(sweep, advanced(held_over(section, mount.height), way - middle))
+                index, section, sweep.laid_out(advanced(held_over(section, mount.height), way - middle))
             )
 
         return carried_on

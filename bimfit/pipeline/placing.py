@@ -20,6 +20,7 @@ from bimfit.scan.boxes import Boxes
 from bimfit.scan.cloud import PointCloud
 from bimfit.scan.formats.options import ANY, ReadOptions, unit_name
 from bimfit.scan.nearby import Gatherer, Nearby, read_ahead
+from bimfit.scan.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from bimfit.bim.joint import Joint
@@ -42,7 +43,10 @@ class Placing:
     Attributes
     ----------
     pose : ndarray, shape (4, 4), or None
-        T_frame_scanner of a scan in scanner coordinates; the frame is the project's or the map's.
+        T_frame_scanner of a scan in scanner coordinates; the frame is the project's or the map's. With a
+        trajectory T_body_scanner: how the scanner sits on the body that moves.
+    trajectory : Trajectory or None
+        T_frame_body while the scan was made.
     crs : {"auto", "project", "map"}
         Which of the two; auto looks in which one the scan shows joints.
     options : ReadOptions
@@ -50,6 +54,7 @@ class Placing:
     """
 
     pose: Array | None = None
+    trajectory: Trajectory | None = None
     crs: Crs = "auto"
     options: ReadOptions = ANY
 
@@ -64,7 +69,8 @@ class Placed:
     crs : {"project", "map"}
         The frame that the scan was taken to be in.
     T_world_file : ndarray, shape (4, 4)
-        What carried the file's coordinates (m) to the model's: a rigid motion times the map's scale.
+        What carried the file's coordinates (m), or those of the trajectory's frame, to the model's: a rigid
+        motion times the map's scale.
     notes : tuple of str
     """
 
@@ -113,7 +119,8 @@ def place_scan(path: Path, model: Model, joints: Sequence[Joint], config: Config
     """
     frames = _frames(model, placing)
     places = Boxes.of(np.concatenate([joint_boxes(joint, config).array for joint in joints]))
-    moves = {name: T @ (np.eye(4) if placing.pose is None else placing.pose) for name, T in frames.items()}
+    still = np.eye(4) if placing.pose is None or placing.trajectory is not None else placing.pose
+    moves = {name: T @ still for name, T in frames.items()}
     gatherers = {name: Gatherer(places) for name in moves}
     for piece in _pieces(path, placing, _in_file(places, moves.values())):
         for name, T in moves.items():
@@ -184,9 +191,23 @@ def _in_file(places: Boxes, moves: Iterable[Array]) -> Boxes:
 def _pieces(path: Path, placing: Placing, boxes: Boxes | None) -> Iterator[Scan]:
     from bimfit.scan.formats import scan_chunks
 
+    boxes = None if placing.trajectory is not None else boxes
     options = replace(placing.options, boxes=None if boxes is None else boxes.array)
     for piece in read_ahead(scan_chunks(path, options)):
+        if placing.trajectory is not None:
+            yield _along(path, piece, placing.trajectory, placing.pose)
+            continue
         yield _only(piece, boxes) if boxes is not None and isinstance(piece, PointCloud) else piece
+
+
+def _along(path: Path, piece: Scan, trajectory: Trajectory, mount: Array | None) -> LineScan:
+    if isinstance(piece, PointCloud):
+        raise ScanError(
+            "a trajectory needs beams with times, and this is a cloud of points",
+            file=path,
+            remedy="give a line scan with a column time",
+        )
+    return trajectory.carry(piece if mount is None else piece.transformed(mount))
 
 
 def _only(cloud: PointCloud, boxes: Boxes) -> PointCloud:

@@ -185,3 +185,26 @@ def test_a_model_in_another_unit_is_named(tmp_path, scene, cloud) -> None:
     write_scan(PointCloud(cloud.points * 1e-3), tmp_path / "c.npz")
     with pytest.raises(ScanError, match="length unit in the model"):
         cuts(tmp_path / "c.npz", (grown, *scene[1:]))
+
+
+def test_a_moving_sensor_is_placed_by_each_beams_own_time(tmp_path, scene) -> None:
+    """The same slices as from the scan in world coordinates; from a file with a column time."""
+    from scipy.spatial.transform import Rotation
+
+    from bimfit.geometry.pose import rigid_inverse
+    from bimfit.scan.trajectory import Trajectory
+
+    scan = scene[2]
+    times = 100.0 + 0.1 * scan.scan + np.tile(np.linspace(0.029, 0.046, 171), len(scan) // 171)
+    ticks = np.arange(99.0, times.max() + 1.0, 0.25)
+    turns = Rotation.from_rotvec(np.outer(ticks, [0.02, -0.01, 0.03]))
+    way = Trajectory(ticks, np.outer(ticks, [0.05, 0.0, 0.01]) + 3.0, turns.as_quat())
+    inverse = np.array([rigid_inverse(pose) for pose in way.poses(times)])
+    own = replace(scan.laid_out(inverse), extra={"time": times})
+    write_scan(scan, tmp_path / "world.npz")
+    write_scan(own, tmp_path / "own.csv")
+    _, found = cuts(tmp_path / "own.csv", scene, Placing(trajectory=way))
+    same(found, cuts(tmp_path / "world.npz", scene)[1], 1e-9)
+    write_scan(PointCloud(scan.hits), tmp_path / "cloud.ply")
+    with pytest.raises(ScanError, match="cloud of points"):
+        cuts(tmp_path / "cloud.ply", scene, Placing(trajectory=way))

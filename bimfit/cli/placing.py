@@ -1,0 +1,70 @@
+"""Where a scan lies: the options that ``fit`` and ``compare`` share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from bimfit.cli.options import read_pose
+from bimfit.cli.sharing import shared_options
+from bimfit.errors import ConfigError
+
+if TYPE_CHECKING:
+    from bimfit.pipeline.placing import Placing
+
+_OPTIONS: dict[str, tuple[Any, Any]] = {
+    "scan_pose": (
+        str | None,
+        typer.Option(
+            None,
+            "--scan-pose",
+            metavar="POSE|FILE",
+            help="Scanner pose in the model (with --trajectory: on the moving body): x,y,z,rx,ry,rz (m, rad) "
+            "or a file of 16 numbers.",
+        ),
+    ),
+    "trajectory": (
+        Path | None,
+        typer.Option(
+            None,
+            "--trajectory",
+            metavar="FILE",
+            help="Poses of a moving sensor, TUM format: time x y z qx qy qz qw; beams have a column time.",
+        ),
+    ),
+    "scan_crs": (
+        str,
+        typer.Option(
+            "auto", "--scan-crs", metavar="CRS", help="Coordinates of the scan: project, map, or auto."
+        ),
+    ),
+    "scan_unit": (
+        str | None,
+        typer.Option(None, "--scan-unit", metavar="UNIT", help="Unit of its lengths: m, mm, cm, ft, ..."),
+    ),
+}
+
+
+def placing(command: Callable[..., int]) -> Callable[..., int]:
+    """Give a command the options that place a scan, as one argument ``where`` (a Placing)."""
+    return shared_options(command, "where", _OPTIONS, _placing)
+
+
+def _placing(
+    *, scan_pose: str | None, trajectory: Path | None, scan_crs: str, scan_unit: str | None
+) -> Placing:
+    from bimfit.pipeline.placing import CRS, Placing
+    from bimfit.scan.formats.options import ReadOptions, unit_named
+    from bimfit.scan.trajectory import read_tum
+
+    if scan_crs not in CRS:
+        raise ConfigError(f"--scan-crs {scan_crs}: is none of {', '.join(CRS)}")
+    return Placing(
+        pose=None if scan_pose is None else read_pose(scan_pose),
+        trajectory=None if trajectory is None else read_tum(trajectory),
+        crs=scan_crs,
+        options=ReadOptions(None if scan_unit is None else unit_named(scan_unit)),
+    )
