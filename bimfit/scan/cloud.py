@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -67,3 +69,30 @@ class PointCloud:
             viewpoint=None if self.viewpoint is None else transform_points(m, self.viewpoint),
             normals=None if self.normals is None else np.asarray(self.normals @ turn),
         )
+
+
+def joined_clouds(clouds: Sequence[PointCloud]) -> PointCloud:
+    """One cloud out of at least one; what not all of them know is left out.
+
+    Where they were seen from different places, which point was seen from where is lost, and said so.
+    """
+    eyes = [cloud.viewpoint for cloud in clouds]
+    notes = tuple(dict.fromkeys(note for cloud in clouds for note in cloud.notes))
+    places = {tuple(eye.tolist()) for eye in eyes if eye is not None}
+    one = len(places) == 1 and all(eye is not None for eye in eyes)
+    if places and not one:
+        notes = (*notes, f"seen from {len(places)} places; read whole, its points do not know which")
+
+    def column(name: str) -> NDArray[Any] | None:
+        values = [getattr(cloud, name) for cloud in clouds]
+        return None if any(value is None for value in values) else np.concatenate(values)
+
+    return replace(
+        clouds[0],
+        points=np.concatenate([cloud.points for cloud in clouds]),
+        viewpoint=eyes[0] if one else None,
+        normals=column("normals"),
+        colors=column("colors"),
+        intensity=column("intensity"),
+        notes=notes,
+    )

@@ -82,9 +82,10 @@ def test_no_sweep_is_lost_split_or_used_twice(ys, yaw, pitch, spacing):
     stations = np.arange(0.1, 0.71, spacing)
     pitch, yaw = math.radians(pitch), math.radians(yaw)
     scan = sweeps(ys, yaw=yaw, pitch=pitch)
-    middle = BEARINGS == 0.0
-    d = np.array([scan.directions[scan.scan == k][middle][0] for k in range(len(ys))])
-    crossing = np.array(ys) + 0.25 * d[:, 1] / d[:, 2]
+    # a sweep meets the surface z = 0 in a straight line: where that crosses the joint, x = 0
+    d = np.array([scan.directions[scan.scan == k][[0, -1]] for k in range(len(ys))])
+    x, y = 0.25 * d[..., 0] / d[..., 2], np.array(ys)[:, None] + 0.25 * d[..., 1] / d[..., 2]
+    crossing = y[:, 0] - x[:, 0] * (y[:, 1] - y[:, 0]) / (x[:, 1] - x[:, 0])
     distance = np.abs(crossing[:, None] - stations)
     if np.any(np.abs(distance - 0.5 * spacing) < 1e-6):
         return  # midway: either neighbour will do

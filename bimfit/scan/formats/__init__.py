@@ -33,6 +33,7 @@ from bimfit.errors import ExportError, ScanError
 from bimfit.files import whole_file
 from bimfit.geometry.line_scan import LineScan
 from bimfit.scan.cloud import PointCloud
+from bimfit.scan.formats.bag import bag_chunks, is_bag_folder, read_bag
 from bimfit.scan.formats.carmen import looks_like_carmen, read_carmen
 from bimfit.scan.formats.copc import copc_chunks, looks_like_copc
 from bimfit.scan.formats.delimited import read_csv, write_csv
@@ -107,6 +108,14 @@ FORMATS: tuple[Format, ...] = (
     Format("COPC", (), read_las, looks=looks_like_copc, chunks=copc_chunks),
     Format("LAS", (".las", ".laz"), read_las, None, (b"LASF",), chunks=las_chunks),
     Format("E57", (".e57",), read_e57, None, (b"ASTM-E57",), chunks=e57_chunks),
+    Format(
+        "ROS bag",
+        (".bag", ".mcap", ".db3"),
+        read_bag,
+        None,
+        (b"#ROSBAG V2.0", b"\x89MCAP0\r\n", b"SQLite format 3\0"),
+        chunks=bag_chunks,
+    ),
     Format("PTX", (".ptx",), _plain(read_ptx)),
     Format("CARMEN log", (".clf",), _plain(read_carmen), looks=looks_like_carmen),
     Format("UBH", (".ubh",), _plain(read_ubh), looks=looks_like_ubh, unit=1e-3),
@@ -179,7 +188,12 @@ def scan_chunks(path: str | Path, options: ReadOptions = ANY) -> Iterator[Scan]:
 def _opened(source: Path) -> Iterator[tuple[Format, Path]]:
     """A file's format, and where it lies unpacked; errors name the file that the user named."""
     if source.is_dir():
-        raise ScanError("is a folder", file=source, remedy="name a scan file")
+        if not is_bag_folder(source):
+            raise ScanError(
+                "is a folder", file=source, remedy="name a scan file, or the folder of a ROS 2 bag"
+            )
+        yield next(form for form in FORMATS if form.chunks is bag_chunks), source
+        return
     head = first_lines(source)
     if not head.startswith(GZIP):
         yield format_of(source, head), source

@@ -24,7 +24,7 @@ from bimfit.errors import ScanError
 from bimfit.geometry.line_scan import LineScan
 from bimfit.geometry.pose import Array, transform_points
 from bimfit.scan.boxes import Boxes
-from bimfit.scan.cloud import PointCloud, usable
+from bimfit.scan.cloud import PointCloud, joined_clouds, usable
 from bimfit.scan.formats.options import ReadOptions
 from bimfit.scan.formats.organised import PLANAR, planarity, swept
 from bimfit.scan.formats.packed import COARSE
@@ -94,7 +94,7 @@ def read_e57(path: Path, options: ReadOptions) -> LineScan | PointCloud:
             str(path),
             notes,
         )
-    return _joined([piece for piece in pieces if isinstance(piece, PointCloud)], notes)
+    return joined_clouds([piece for piece in pieces if isinstance(piece, PointCloud)])
 
 
 def e57_chunks(path: Path, options: ReadOptions) -> Iterator[LineScan | PointCloud]:
@@ -392,23 +392,4 @@ def _kept(cloud: PointCloud, keep: NDArray[np.bool_]) -> PointCloud:
         points=cloud.points[keep],
         colors=None if cloud.colors is None else cloud.colors[keep],
         intensity=None if cloud.intensity is None else cloud.intensity[keep],
-    )
-
-
-def _joined(pieces: list[PointCloud], notes: tuple[str, ...]) -> PointCloud:
-    eyes = [piece.viewpoint for piece in pieces]
-    one = eyes[0] is not None and all(eye is not None and np.array_equal(eye, eyes[0]) for eye in eyes)
-    if not one and any(eye is not None for eye in eyes):
-        places = {tuple(eye.tolist()) for eye in eyes if eye is not None}
-        notes = (*notes, f"seen from {len(places)} places; read whole, its points do not know which")
-    colors = [piece.colors for piece in pieces if piece.colors is not None]
-    bright = [piece.intensity for piece in pieces if piece.intensity is not None]
-    return PointCloud(
-        np.concatenate([piece.points for piece in pieces]),
-        eyes[0] if one else None,
-        None,
-        np.concatenate(colors) if len(colors) == len(pieces) else None,
-        np.concatenate(bright) if len(bright) == len(pieces) else None,
-        pieces[0].source,
-        notes,
     )

@@ -28,6 +28,8 @@ class ReadOptions:
         Metres a unit of length in the file. None: what the file or its format says, else metres.
     topic : str
         Which topic of a ROS bag; empty takes the only one.
+    frame : str
+        The frame of a ROS bag in whose coordinates the scan is wanted; empty takes the one above all others.
     pixel : tuple of 3 float or None
         Of height maps and profiles: distance between columns, distance between rows, and height of one
         count, m; None for those that the file names itself. A negative distance mirrors the map.
@@ -38,6 +40,7 @@ class ReadOptions:
 
     unit: float | None = None
     topic: str = ""
+    frame: str = ""
     pixel: tuple[float | None, float | None, float | None] = (None, None, None)
     boxes: Array | None = None
 
