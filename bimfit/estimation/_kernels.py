@@ -151,8 +151,23 @@ def sort_beams(
 
 
 @jit
-def median_step(d: Array) -> float:
-    """Median angle between neighbouring beams that differ at all, rad; 0 for none."""
+def usual_step(step: Array) -> float:
+    """The step that half of the whole length is made of: each counts by its length; 0 without any."""
+    if step.shape[0] == 0:
+        return 0.0
+    ordered = np.sort(step)
+    half = 0.5 * ordered.sum()
+    total = 0.0
+    for k in range(ordered.shape[0]):
+        total += ordered[k]
+        if total >= half:
+            return float(ordered[k])
+    return float(ordered[-1])
+
+
+@jit
+def beam_spacing(d: Array) -> float:
+    """Usual angle between neighbouring beams that differ at all, rad; 0 for none."""
     n = d.shape[1]
     step = np.empty(max(n - 1, 1))
     count = 0
@@ -161,7 +176,7 @@ def median_step(d: Array) -> float:
         if x > 1e-7:
             step[count] = x
             count += 1
-    return float(np.median(step[:count])) if count else 0.0
+    return usual_step(step[:count])
 
 
 @jit

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bimfit.config import SensorConfig
+from bimfit.estimation.likelihood import usual_step
 from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.pose import Array, Pose2D
 from bimfit.geometry.slice import Beams, Slice
@@ -16,6 +18,9 @@ _ASSUMED_DISTANCE = 1.0
 _HOLE = 1.8
 _REGULAR = 0.2
 _MOST = 400
+_WINDOW = 6.0
+_CLIP = 3.0
+_LOOKS = 12
 
 
 @dataclass(frozen=True)
@@ -50,16 +55,17 @@ def virtual_beams(
     if slice_.viewpoint is not None:
         eye = np.asarray(slice_.viewpoint, float)
     else:
-        eye = _recovered(points, centre, combined)
+        found = recovered_viewpoint([points], combined)
+        eye = centre + combined.turn((0.0, _ASSUMED_DISTANCE)) if found is None else found
     b, r = _bearings(points, eye, centre)
     step = np.diff(b)
-    local = np.maximum(_local_median(step), 1e-9)
+    local = np.maximum(_local_step(b, step), 1e-9)
     regular = _irregularity(step) < _REGULAR
-    if not regular:  # a hole is then judged by how many points were to be expected in it
-        local = np.maximum(_local_mean(step), 1e-9)
+    # among points at random, half of the length lies in steps of at least 1.7 of their mean
+    fill = local if regular else 0.5 * local
     bearings, ranges = [b], [r]
     for i in np.flatnonzero(step > _HOLE * local):
-        n = min(max(round(step[i] / local[i]) - 1, 1), _MOST)
+        n = min(max(round(step[i] / fill[i]) - 1, 1), _MOST)
         bearings.append(b[i] + step[i] * np.arange(1, n + 1) / (n + 1))
         ranges.append(np.full(n, np.nan))
     all_b, all_r = np.concatenate(bearings), np.concatenate(ranges)
@@ -89,21 +95,42 @@ def _bearings(points: Array, eye: Array, centre: Array) -> tuple[Array, Array]:
 
 
 def _irregularity(step: Array) -> float:
-    """Mean of min(|step / median - 1|, 1/2): 0 for an even fan of beams, about 0.4 for points at random."""
-    if len(step) < 8:
+    """Mean over the length of min(|step / usual - 1|, 1/2): 0 for an even fan, about 0.4 at random.
+
+    Steps count by their length, so that several rows whose points nearly coincide are as regular as one.
+    """
+    usual = usual_step(step)
+    if len(step) < 8 or usual <= 0.0:
         return 0.5
-    return float(np.mean(np.minimum(np.abs(step / max(float(np.median(step)), 1e-12) - 1.0), 0.5)))
+    return float(np.minimum(np.abs(step / usual - 1.0), 0.5) @ step / step.sum())
 
 
-def _recovered(points: Array, centre: Array, combined: Pose2D) -> Array:
-    """The place above the joint from which the bearings are most regular; straight above when none is."""
-    up = combined.turn((0.0, 1.0))
+def recovered_viewpoint(slices: Sequence[Array], combined: Pose2D) -> Array | None:
+    """The place above the joint from which the points' bearings are most regular.
+
+    Parameters
+    ----------
+    slices : sequence of ndarray, shape (n, 2)
+        Points of stations that one sensor saw from the same place in the section plane.
+    combined : Pose2D
+        About where the joint is.
+
+    Returns
+    -------
+    ndarray, shape (2,), or None
+        None where the points are irregular from everywhere.
+    """
+    if not slices:
+        return None
+    centre, up = combined.apply((0.0, 0.0)), combined.turn((0.0, 1.0))
+    picked = [slices[int(k)] for k in np.unique(np.linspace(0, len(slices) - 1, _LOOKS).round())]
 
     def place(angle: float, distance: float) -> Array:
         return np.asarray(centre + distance * Pose2D(theta=angle).turn(up))
 
     def cost(angle: float, distance: float) -> float:
-        return _irregularity(np.diff(_bearings(points, place(angle, distance), centre)[0]))
+        eye = place(angle, distance)
+        return float(np.mean([_irregularity(np.diff(_bearings(p, eye, centre)[0])) for p in picked]))
 
     angles, distances = np.radians(np.arange(-60.0, 61.0, 10.0)), np.geomspace(0.12, 6.0, 16)
     best = min(((cost(a, d), a, d) for a in angles for d in distances), key=lambda x: x[0])
@@ -113,22 +140,20 @@ def _recovered(points: Array, centre: Array, combined: Pose2D) -> Array:
         trials = [(a + i * width, d * ratio**j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
         best = min([best, *((cost(*t), *t) for t in trials)], key=lambda x: x[0])
         width, ratio = 0.5 * width, ratio**0.5
-    if best[0] < _REGULAR:
-        return place(best[1], best[2])
-    return place(0.0, _ASSUMED_DISTANCE)
+    return place(best[1], best[2]) if best[0] < _REGULAR else None
 
 
-def _windows(step: Array, half: int = 5) -> list[Array]:
-    return [step[max(0, i - half) : i + half + 1] for i in range(len(step))]
-
-
-def _local_median(step: Array) -> Array:
-    """Median of the spacings about each."""
-    return np.array([np.median(w) for w in _windows(step)]) if len(step) else step
-
-
-def _local_mean(step: Array) -> Array:
-    """Mean of the spacings about each, the widest left out: it is the hole that is being judged."""
-    if len(step) < 3:
+def _local_step(b: Array, step: Array) -> Array:
+    """The usual step about each, without itself: it may be the hole that is being judged."""
+    usual = usual_step(step)
+    if len(step) < 3 or usual <= 0.0:
         return step
-    return np.array([(w.sum() - w.max()) / (len(w) - 1) for w in _windows(step)])
+    kept = np.minimum(step, _CLIP * usual)
+    sums = np.concatenate([[0.0], np.cumsum(kept)])
+    squares = np.concatenate([[0.0], np.cumsum(kept * kept)])
+    low = np.searchsorted(b, b[:-1] - _WINDOW * usual)
+    high = np.searchsorted(b, b[1:] + _WINDOW * usual, side="right") - 1
+    length = sums[high] - sums[low] - kept
+    return np.where(
+        length > usual, (squares[high] - squares[low] - kept * kept) / np.maximum(length, 1e-12), usual
+    )

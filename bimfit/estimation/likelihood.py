@@ -140,14 +140,23 @@ class BeamSet:
 
     @cached_property
     def spacing(self) -> float:
-        """Median angle between neighbouring beams, rad; 0 for fewer than two."""
-        return float(_kernels.median_step(self.d))
+        """Usual angle between neighbouring beams, rad; 0 for fewer than two.
+
+        The median over the angle that they span, not over the beams: several rows or sweeps whose beams
+        nearly coincide are as far apart as their clusters are.
+        """
+        return float(_kernels.beam_spacing(self.d))
 
     @property
     def points(self) -> Array:
         """Where each beam ended (nonsense for misses), shape (n, 2)."""
         origin = np.repeat(self.eye[:, :2], np.diff(self.start), axis=0)
         return np.asarray(origin + (self.d * self.r).T)
+
+
+def usual_step(step: Array) -> float:
+    """The step that half of the whole length is made of: each counts by its length; 0 without any."""
+    return float(_kernels.usual_step(np.ascontiguousarray(step, np.float64)))
 
 
 def edge_rows(profile: Profile, pose: Pose2D | None = None) -> Array:

@@ -23,7 +23,7 @@ from bimfit.pipeline.listing import model_joints as model_joints
 from bimfit.pipeline.placing import NEAR, Placing, joint_boxes, place_scan
 from bimfit.pipeline.records import JointResult, SurveyResult
 from bimfit.pipeline.shown import share_shown
-from bimfit.pipeline.targets import match_reach, with_assumed_view
+from bimfit.pipeline.targets import match_reach, with_assumed_view, with_recovered_view
 from bimfit.scan.cloud import PointCloud
 from bimfit.scan.coverage import covers, scan_stations
 from bimfit.scan.nearby import Nearby
@@ -217,6 +217,8 @@ def cut_joint(
         thickness=config.slices.thickness,
         reach=match_reach(config),
     )
+    if eye is None:
+        slices = with_recovered_view(slices)
     viewed = [with_assumed_view(cut, section) for cut, section in zip(slices, sections, strict=True)]
     return joint, tuple(sections), tuple(viewed)
 

@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bimfit.config import Config, SearchConfig
+from bimfit.estimation.cloud import recovered_viewpoint
 from bimfit.geometry.joint_section import JointSection
-from bimfit.geometry.pose import Array
+from bimfit.geometry.pose import Array, Pose2D
 from bimfit.geometry.slice import Slice
 from bimfit.geometry.visibility import clip_edges, visible_edges
 from bimfit.registration.table import Tables, Target
@@ -149,6 +150,15 @@ def with_assumed_view(slice_: Slice, section: JointSection) -> Slice:
         return slice_
     out = aim(section, _FREE_VIEW)
     return slice_ if out[0] == 0.0 else dataclasses.replace(slice_, viewpoint=_FAR_VIEW * out)
+
+
+def with_recovered_view(slices: Sequence[Slice]) -> tuple[Slice, ...]:
+    """Slices of a cloud that does not know its sensor, seen from where all their bearings are most regular.
+
+    As they are where the points are regular from nowhere.
+    """
+    eye = recovered_viewpoint([cut.points for cut in slices if len(cut.points)], Pose2D())
+    return tuple(slices if eye is None else (dataclasses.replace(cut, viewpoint=eye) for cut in slices))
 
 
 def _view_cell(viewpoint: Array) -> tuple[int, int]:

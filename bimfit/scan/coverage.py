@@ -18,6 +18,8 @@ NEAREST_SWEEPS = 1e-3
 SLICE_POINTS = 40
 """How many points within reach a slice of a cloud should have."""
 MOST_STATIONS = 1000
+NEAREST_SLICES = 5e-3
+"""Slices of a cloud are at least this far apart: in less, nothing that is built moves, m."""
 _CELL = 0.005
 _CELL_POINTS = 3
 _MOST_BEAMS = 500_000
@@ -55,7 +57,7 @@ def scan_stations(
 
     With ``spacing``, on the multiples of it that the scan covers. Without it, at every sweep that lies across
     the joint (sweeps within 1 mm of one another share a station), or such that slices of a cloud have about
-    40 points within reach, but at least 1 mm apart.
+    40 points within reach, but at least 5 mm apart.
 
     Parameters
     ----------
@@ -84,7 +86,7 @@ def scan_stations(
         return s
     low, high = np.quantile(s, [0.002, 0.998])
     extent = max(float(high - low), 1e-9)
-    stations = int(np.clip(count / SLICE_POINTS, 1, min(MOST_STATIONS, max(1.0, extent / NEAREST_SWEEPS))))
+    stations = int(np.clip(count / SLICE_POINTS, 1, min(MOST_STATIONS, max(1.0, extent / NEAREST_SLICES))))
     return np.asarray(low + extent * (np.arange(stations) + 0.5) / stations)
 
 
