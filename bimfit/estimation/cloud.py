@@ -17,6 +17,8 @@ from bimfit.geometry.slice import Beams, Slice
 _ASSUMED_DISTANCE = 1.0
 _HOLE = 1.8
 _REGULAR = 0.2
+_FAN = 0.12
+"""So regular are the bearings from where a sensor stood; a few points at random may come to 0.2."""
 _MOST = 400
 _WINDOW = 6.0
 _CLIP = 3.0
@@ -140,7 +142,7 @@ def recovered_viewpoint(slices: Sequence[Array], combined: Pose2D) -> Array | No
         trials = [(a + i * width, d * ratio**j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
         best = min([best, *((cost(*t), *t) for t in trials)], key=lambda x: x[0])
         width, ratio = 0.5 * width, ratio**0.5
-    return place(best[1], best[2]) if best[0] < _REGULAR else None
+    return place(best[1], best[2]) if best[0] < _FAN else None
 
 
 def _local_step(b: Array, step: Array) -> Array:
