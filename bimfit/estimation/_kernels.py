@@ -176,7 +176,7 @@ def beam_spacing(d: Array) -> float:
         if x > 1e-7:
             step[count] = x
             count += 1
-    return usual_step(step[:count])
+    return float(usual_step(step[:count]))
 
 
 @jit
