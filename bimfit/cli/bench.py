@@ -10,7 +10,9 @@ from bimfit.cli.progress import terminal_progress
 
 
 def run(
-    suite: str = typer.Option("accuracy", "--suite", metavar="NAME", help="accuracy, matcher or matcher-3d."),
+    suite: str = typer.Option(
+        "accuracy", "--suite", metavar="NAME", help="accuracy, matcher, matcher-3d or scan."
+    ),
     joints: int = typer.Option(100, "--joints", min=1, help="Random joints (matcher-3d: starts)."),
     seed: int = typer.Option(1000, "--seed", min=0, help="Seed of the first joint."),
     json_file: Path | None = typer.Option(

@@ -13,6 +13,7 @@ from bimfit.config import Config, SearchConfig
 from bimfit.geometry.pose import Pose2D
 from bimfit.geometry.slice import Slice
 from bimfit.pipeline.accuracy import accuracy_table, joint_errors, table_text, time_text
+from bimfit.pipeline.bench_scan import bench_scan
 from bimfit.pipeline.compare import Cut
 from bimfit.pipeline.fit import fit_joint
 from bimfit.pipeline.records import JointResult
@@ -28,7 +29,7 @@ from bimfit.simulation.scenario import Scenario
 from bimfit.simulation.truth import JointTruth
 
 Progress = Callable[[str, float], None]
-SUITES = ("accuracy", "matcher", "matcher-3d")
+SUITES = ("accuracy", "matcher", "matcher-3d", "scan")
 REFERENCE = "square-butt-ifc4.ifc"
 
 
@@ -42,6 +43,8 @@ class Bench:
 
 def bench(suite: str, *, joints: int, seed: int, progress: Progress) -> Bench:
     """Run one suite of :data:`SUITES` over so many seeded joints of the reference scenario."""
+    if suite == "scan":
+        return Bench(*bench_scan(seed, progress))
     run = {"accuracy": bench_accuracy, "matcher": bench_matcher, "matcher-3d": bench_space}[suite]
     return run(joints, seed, progress)
 

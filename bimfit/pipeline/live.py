@@ -49,9 +49,10 @@ RECENT = 20
 """So many sweeps say what the sensor's noise is."""
 SWEEPS = 1000
 """So many sweeps are prepared for: building the faster look-up tables pays."""
+LEFT_OUT = "left out: this computer does not keep up"
 MOST_WAITING = 3
 """With more sweeps waiting than that, the older ones are left out."""
-_SKIPPED = Status("no_data", "left out: this computer does not keep up")
+_SKIPPED = Status("no_data", LEFT_OUT)
 _STEP = 0.01
 _PROFILES = 0.02
 """Distance at which a joint's profile is looked at beforehand, m."""
@@ -316,7 +317,7 @@ class Live:
                 with closing(device.scans(*steps, count=sweeps)) as stream:  # type: ignore[type-var]
                     for sweep in stream:
                         if device.waiting > MOST_WAITING:
-                            yield LiveStation(sweep.index, math.nan, _SKIPPED)
+                            yield LiveStation(sweep.index, math.nan, _SKIPPED, stamp=sweep.stamp_device)
                             continue
                         station = place(sweep.index, line_scan([sweep]), sweep.times)
                         if station is None:

@@ -42,7 +42,7 @@ class StampOrder:
 
     The sums that guard a scan are weak, and a line that stutters may send one twice. A stamp that does not
     come after the last one, or a long time after it, is not believed; unless the next one follows it, as when
-    the device's clock was set, or the host slept.
+    the device's clock was set, or the host slept. One that was believed before is never believed again.
 
     Parameters
     ----------
@@ -56,14 +56,18 @@ class StampOrder:
         self._turn = turn
         self._last: int | None = None
         self._doubted: int | None = None
+        self._believed: deque[int] = deque(maxlen=100)
 
     def believes(self, stamp: int) -> bool:
         """Take a scan's stamp (ms, 24 bits)."""
+        if stamp in self._believed:
+            return False
         good = self._follows(self._last, stamp, self.LONGEST) or self._follows(
             self._doubted, stamp, 3.0 * self._turn
         )
         if self._last is None or good:
             self._last, self._doubted = stamp, None
+            self._believed.append(stamp)
             return True
         self._doubted = stamp
         return False

@@ -80,6 +80,8 @@ def test_what_comes_twice_late_or_from_nowhere_is_doubted_once():
     assert [order.believes(stamp) for stamp in told] == [
         True, True, False, True, False, True, False, True, True,
     ]  # fmt: skip
+    assert not any(order.believes(stamp) for stamp in told)  # a line that stutters sends many again
+    assert order.believes(1600)
 
 
 def test_a_clock_that_was_set_is_followed():
