@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bimfit.bim.bands import middle_line
 from bimfit.bim.broad import face_pairs
 from bimfit.bim.clearance import judge
-from bimfit.bim.faces import Faces, Index, cross, dot, find_faces, overlapping
+from bimfit.bim.faces import Faces, Index, cross, dot, find_faces, overlapping, ranges
 from bimfit.bim.kind import Stations, classify, free_sides
 from bimfit.bim.merge import Leg, merge
 from bimfit.bim.narrow import PairFrames, facing_pieces, pair_frames
@@ -26,6 +26,8 @@ _PARALLEL = math.radians(10.0)
 _GROOVE = math.radians(100.0)
 _GROOVE_FACE = 0.1
 _GROOVE_ROOT = 0.02
+_BLUNT = (math.cos(math.radians(80.0)), math.cos(math.radians(5.0)))
+_MANY_FACES = 64
 _FULL = 0.9
 _BAND_DEPTH = 0.5
 _ROUNDING = 1e-9
@@ -141,7 +143,10 @@ def _band(strips: Strips, k: int) -> tuple[Array, bool] | None:
 def _add_grooves(
     faces: Faces, eligible: NDArray[np.bool_], limits: Limits, groups: dict[Key, list[Leg]]
 ) -> None:
-    """Grooves without a root land: slim faces at a wide angle, of elements of which nothing else meets."""
+    """Grooves without a root land: slim faces at a wide angle, of elements of which nothing else meets.
+
+    At least one of the two is a prepared edge: its element has another face that it leads on to bluntly.
+    """
     diagonal = np.linalg.norm(faces.high - faces.low, axis=1)
     slim = (faces.area < _GROOVE_FACE * diagonal) & (faces.area < diagonal**2 / 3.0)
     a, b = face_pairs(
@@ -154,7 +159,8 @@ def _add_grooves(
     )
     count = len(faces.starts)
     taken = np.unique([key[0] * count + key[1] for key in groups]) if groups else np.zeros(0, np.int64)
-    fresh = ~np.isin(faces.element[a] * count + faces.element[b], taken)
+    prepared = _blunt_edged(faces, slim)
+    fresh = (prepared[a] | prepared[b]) & ~np.isin(faces.element[a] * count + faces.element[b], taken)
     # they come as near as the root is wide
     fresh &= overlapping(
         faces.low[a] - _GROOVE_ROOT, faces.high[a] + _GROOVE_ROOT, faces.low[b], faces.high[b]
@@ -168,6 +174,20 @@ def _add_grooves(
     )
     for key, legs in _legs(faces, frames, strips, limits).items():
         groups[key].extend(replace(leg, groove=True) for leg in legs)
+
+
+def _blunt_edged(faces: Faces, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which of the chosen faces may meet another of its element's at a blunt angle, shape (faces,)."""
+    out = chosen.copy()
+    count = np.bincount(faces.element, minlength=len(faces.starts) - 1)
+    order, first = np.argsort(faces.element, kind="stable"), np.cumsum(count) - count
+    some = np.flatnonzero(chosen & (count[faces.element] <= _MANY_FACES))
+    sizes = count[faces.element[some]]
+    row, other = np.repeat(some, sizes), order[ranges(first[faces.element[some]], sizes)]
+    cosine = dot(faces.normal[row], faces.normal[other])
+    out[some] = False
+    out[row[(cosine > _BLUNT[0]) & (cosine < _BLUNT[1])]] = True
+    return out
 
 
 def _finish(faces: Faces, rows: Sequence[tuple[Key, Leg]]) -> list[Draft]:

@@ -11,9 +11,11 @@ from bimfit.cli.progress import terminal_progress
 
 def run(
     suite: str = typer.Option(
-        "accuracy", "--suite", metavar="NAME", help="accuracy, matcher, matcher-3d or scan."
+        "accuracy", "--suite", metavar="NAME", help="accuracy, matcher, matcher-3d, scan, bim or fuzz."
     ),
-    joints: int = typer.Option(100, "--joints", min=1, help="Random joints (matcher-3d: starts)."),
+    joints: int = typer.Option(
+        100, "--joints", min=1, help="Random joints (matcher-3d: starts; fuzz: files)."
+    ),
     seed: int = typer.Option(1000, "--seed", min=0, help="Seed of the first joint."),
     json_file: Path | None = typer.Option(
         None, "--json", metavar="FILE", help="Write the figures there, too."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -13,7 +14,6 @@ from bimfit.config import Config, SearchConfig
 from bimfit.geometry.pose import Pose2D
 from bimfit.geometry.slice import Slice
 from bimfit.pipeline.accuracy import accuracy_table, joint_errors, table_text, time_text
-from bimfit.pipeline.bench_scan import bench_scan
 from bimfit.pipeline.compare import Cut
 from bimfit.pipeline.fit import fit_joint
 from bimfit.pipeline.records import JointResult
@@ -29,7 +29,15 @@ from bimfit.simulation.scenario import Scenario
 from bimfit.simulation.truth import JointTruth
 
 Progress = Callable[[str, float], None]
-SUITES = ("accuracy", "matcher", "matcher-3d", "scan")
+SUITES = {
+    "accuracy": "bimfit.pipeline.bench:bench_accuracy",
+    "matcher": "bimfit.pipeline.bench:bench_matcher",
+    "matcher-3d": "bimfit.pipeline.bench:bench_space",
+    "scan": "bimfit.pipeline.bench_scan:bench_scan",
+    "bim": "bimfit.pipeline.bench_bim:bench_bim",
+    "fuzz": "bimfit.pipeline.bench_fuzz:bench_fuzz",
+}
+"""Each suite's function of (joints, seed, progress), which returns a Bench or its (text, data)."""
 REFERENCE = "square-butt-ifc4.ifc"
 
 
@@ -42,11 +50,10 @@ class Bench:
 
 
 def bench(suite: str, *, joints: int, seed: int, progress: Progress) -> Bench:
-    """Run one suite of :data:`SUITES` over so many seeded joints of the reference scenario."""
-    if suite == "scan":
-        return Bench(*bench_scan(seed, progress))
-    run = {"accuracy": bench_accuracy, "matcher": bench_matcher, "matcher-3d": bench_space}[suite]
-    return run(joints, seed, progress)
+    """Run one suite of :data:`SUITES` over so many seeded joints (fuzz: files)."""
+    module, name = SUITES[suite].split(":")
+    result = getattr(importlib.import_module(module), name)(joints, seed, progress)
+    return result if isinstance(result, Bench) else Bench(*result)
 
 
 def bench_accuracy(joints: int, seed: int, progress: Progress) -> Bench:

@@ -16,7 +16,7 @@ ROWS: tuple[tuple[str, Callable[[int, Progress], Figures]], ...] = (
 """What is measured, in order: a name for the JSON and a function of the seed and of whom to tell."""
 
 
-def bench_scan(seed: int, progress: Progress) -> tuple[str, dict[str, Any]]:
+def bench_scan(_joints: int, seed: int, progress: Progress) -> tuple[str, dict[str, Any]]:
     """Every row of :data:`ROWS`: the text to print, and the data by their names."""
     found = {name: measure(seed, progress) for name, measure in ROWS}
     return "\n".join(row.text for row in found.values()), {name: row.data for name, row in found.items()}
