@@ -28,6 +28,7 @@ _GROOVE_FACE = 0.1
 _GROOVE_ROOT = 0.02
 _BLUNT = (math.cos(math.radians(80.0)), math.cos(math.radians(5.0)))
 _MANY_FACES = 64
+_SHARP = math.cos(math.radians(80.0))
 _FULL = 0.9
 _BAND_DEPTH = 0.5
 _ROUNDING = 1e-9
@@ -145,7 +146,8 @@ def _add_grooves(
 ) -> None:
     """Grooves without a root land: slim faces at a wide angle, of elements of which nothing else meets.
 
-    At least one of the two is a prepared edge: its element has another face that it leads on to bluntly.
+    Where they are nearly square to one another, as the faces of blocks are round a corner, one of them has to
+    be a prepared edge: its element has another face that it leads on to bluntly.
     """
     diagonal = np.linalg.norm(faces.high - faces.low, axis=1)
     slim = (faces.area < _GROOVE_FACE * diagonal) & (faces.area < diagonal**2 / 3.0)
@@ -160,7 +162,8 @@ def _add_grooves(
     count = len(faces.starts)
     taken = np.unique([key[0] * count + key[1] for key in groups]) if groups else np.zeros(0, np.int64)
     prepared = _blunt_edged(faces, slim)
-    fresh = (prepared[a] | prepared[b]) & ~np.isin(faces.element[a] * count + faces.element[b], taken)
+    sharp = -dot(faces.normal[a], faces.normal[b]) > _SHARP
+    fresh = (sharp | prepared[a] | prepared[b]) & ~np.isin(faces.element[a] * count + faces.element[b], taken)
     # they come as near as the root is wide
     fresh &= overlapping(
         faces.low[a] - _GROOVE_ROOT, faces.high[a] + _GROOVE_ROOT, faces.low[b], faces.high[b]

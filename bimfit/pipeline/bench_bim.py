@@ -215,12 +215,8 @@ def _runs(models: dict[str, Path]) -> Rows:
 
 
 def _run(path: Path, cache: str, *options: str) -> float:
-    words = [
-        sys.executable,
-        "-m",
-        "bimfit",
-        *(options if options == ("--version",) else ("joints", path, *options)),
-    ]
+    asked = options if options == ("--version",) else ("joints", str(path), *options)
+    words = [sys.executable, "-m", "bimfit", *asked]
     home = str(Path(bimfit.__file__).resolve().parents[1])
     paths = os.pathsep.join(part for part in (home, os.environ.get("PYTHONPATH", "")) if part)
     environment = {**os.environ, "BIMFIT_CACHE": cache, "PYTHONPATH": paths}
