@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 import typer
 
 from bimfit import __version__
-from bimfit.cli import bench, capture, compare, demo, emulate, fit, joints, live, simulate, view
+from bimfit.cli import bench, capture, compare, convert, demo, emulate, fit, joints, live, simulate, view
 from bimfit.errors import BimfitError
 
 CACHE_OFF = "BIMFIT_NO_CACHE"
@@ -31,6 +31,7 @@ app.command("joints")(joints.run)
 app.command("fit")(fit.run)
 app.command("compare")(compare.run)
 app.command("simulate")(simulate.run)
+app.command("convert")(convert.run)
 app.command("capture")(capture.run)
 app.command("emulate")(emulate.run)
 app.command("live")(live.run)

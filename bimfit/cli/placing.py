@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from bimfit.cli.options import read_pose
+from bimfit.cli.reading import READING, read_options
 from bimfit.cli.sharing import shared_options
 from bimfit.errors import ConfigError
 
@@ -41,10 +42,7 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {
             "auto", "--scan-crs", metavar="CRS", help="Coordinates of the scan: project, map, or auto."
         ),
     ),
-    "scan_unit": (
-        str | None,
-        typer.Option(None, "--scan-unit", metavar="UNIT", help="Unit of its lengths: m, mm, cm, ft, ..."),
-    ),
+    **READING,
 }
 
 
@@ -53,11 +51,8 @@ def placing(command: Callable[..., int]) -> Callable[..., int]:
     return shared_options(command, "where", _OPTIONS, _placing)
 
 
-def _placing(
-    *, scan_pose: str | None, trajectory: Path | None, scan_crs: str, scan_unit: str | None
-) -> Placing:
+def _placing(*, scan_pose: str | None, trajectory: Path | None, scan_crs: str, **how: Any) -> Placing:
     from bimfit.pipeline.placing import CRS, Placing
-    from bimfit.scan.formats.options import ReadOptions, unit_named
     from bimfit.scan.trajectory import read_tum
 
     if scan_crs not in CRS:
@@ -66,5 +61,5 @@ def _placing(
         pose=None if scan_pose is None else read_pose(scan_pose),
         trajectory=None if trajectory is None else read_tum(trajectory),
         crs=scan_crs,
-        options=ReadOptions(None if scan_unit is None else unit_named(scan_unit)),
+        options=read_options(**how),
     )

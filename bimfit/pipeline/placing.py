@@ -19,6 +19,7 @@ from bimfit.pipeline.targets import match_reach
 from bimfit.scan.boxes import Boxes
 from bimfit.scan.cloud import PointCloud
 from bimfit.scan.formats.options import ANY, ReadOptions, unit_name
+from bimfit.scan.formats.summary import seen_from
 from bimfit.scan.nearby import Gatherer, Nearby, read_ahead
 from bimfit.scan.trajectory import Trajectory
 
@@ -139,10 +140,13 @@ def what_is_near(nearby: Nearby) -> str:
     """What a scan shows near the joints, in a line that a user can check."""
     if isinstance(nearby.scan, LineScan):
         beams, sweeps = len(nearby.scan), len(nearby.scan.sweeps)
-        return f"{beams:,} beams in {sweeps:,} sweeps, {nearby.returns:,} of their returns near the joints"
+        near = f"{nearby.returns:,} of their returns near the joints"
+        return f"{beams:,} beams in {sweeps:,} sweeps, {near}, {seen_from(nearby.scan.origins)}"
     low, high = nearby.scan.bounds
     corners = " to ".join("(" + ", ".join(f"{x:.10g}" for x in np.round(c, 4)) + ")" for c in (low, high))
-    return f"{len(nearby.scan):,} points near the joints, from {corners} m"
+    eyes = [eye for _, eye in nearby.eyes if eye is not None]
+    places = seen_from(np.array(eyes) if eyes else None)
+    return f"{len(nearby.scan):,} points near the joints, from {corners} m, {places}"
 
 
 def moved(scan: Scan, T: Array) -> Scan:

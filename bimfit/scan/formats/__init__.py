@@ -5,7 +5,7 @@ near some places says so by ``ReadOptions.boxes``. A format takes part by ``chun
 
     def las_chunks(path: Path, options: ReadOptions) -> Iterator[PointCloud]: ...
     Format("COPC", (), read_las, looks=looks_like_copc, chunks=copc_chunks),
-    Format("LAS", (".las", ".laz"), read_las, None, (b"LASF",), chunks=las_chunks)
+    Format("LAS", (".las", ".laz"), read_las, write_las, (b"LASF",), chunks=las_chunks)
 
 - It yields ``PointCloud`` (or ``LineScan``) pieces in the file's order and unit, float64, of about a million
   points, never holding more than a piece or two; what it cannot read is an error as for ``read``, at the
@@ -39,7 +39,7 @@ from bimfit.scan.formats.copc import copc_chunks, looks_like_copc
 from bimfit.scan.formats.delimited import read_csv, write_csv
 from bimfit.scan.formats.e57 import e57_chunks, read_e57
 from bimfit.scan.formats.hokuyo_logs import looks_like_breezy, looks_like_ubh, read_breezy, read_ubh
-from bimfit.scan.formats.las import las_chunks, read_las
+from bimfit.scan.formats.las import las_chunks, read_las, write_las
 from bimfit.scan.formats.npz import read_npz, write_npz
 from bimfit.scan.formats.options import ANY, ReadOptions, unit_name
 from bimfit.scan.formats.packing import GZIP, unpacked
@@ -106,7 +106,7 @@ FORMATS: tuple[Format, ...] = (
     Format("PLY", (".ply",), _plain(read_ply), write_ply, (b"ply\n", b"ply\r\n")),
     Format("PCD", (".pcd",), _plain(read_pcd), write_pcd, (b"# .PCD", b"VERSION 0.7", b"VERSION .7")),
     Format("COPC", (), read_las, looks=looks_like_copc, chunks=copc_chunks),
-    Format("LAS", (".las", ".laz"), read_las, None, (b"LASF",), chunks=las_chunks),
+    Format("LAS", (".las", ".laz"), read_las, write_las, (b"LASF",), chunks=las_chunks),
     Format("E57", (".e57",), read_e57, None, (b"ASTM-E57",), chunks=e57_chunks),
     Format(
         "ROS bag",
@@ -164,6 +164,8 @@ def read_scan(path: str | Path, unit: float | None = None, options: ReadOptions 
 
 def scan_chunks(path: str | Path, options: ReadOptions = ANY) -> Iterator[Scan]:
     """Read a scan in pieces, in the file's order, never holding more than a few of them.
+
+    Every piece's last note names the format and its unit.
 
     Parameters
     ----------

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from bimfit.errors import ScanError
+from bimfit.errors import ExportError, ScanError
+from bimfit.geometry.line_scan import LineScan
 from bimfit.geometry.pose import Array
 from bimfit.scan.boxes import Boxes
 from bimfit.scan.cloud import PointCloud, usable
@@ -20,6 +21,7 @@ from bimfit.scan.formats.packed import COARSE
 from bimfit.scan.formats.text import first_lines
 
 _CHUNK = 500_000
+_STEP = 1e-4
 
 
 def read_las(path: Path, options: ReadOptions = ANY) -> PointCloud:
@@ -131,3 +133,34 @@ def las_errors(path: Path) -> Iterator[None]:
         laspy.LaspyException,
     ) as error:
         raise ScanError(f"not a LAS file, or damaged: {error}", file=path) from error
+
+
+def write_las(scan: LineScan | PointCloud, path: Path) -> None:
+    """Write a cloud as LAS 1.4, or LAZ where the name says so, in steps of 0.1 mm from a whole-metre offset.
+
+    Raises
+    ------
+    ExportError
+        When the cloud is too wide for such steps, or laspy is not installed.
+    """
+    try:
+        import laspy
+    except ImportError as error:
+        raise ExportError(
+            "writing LAS needs the package laspy", file=path, remedy='pip install "bimfit[las]"'
+        ) from error
+    assert isinstance(scan, PointCloud)
+    header = laspy.LasHeader(point_format=6 if scan.colors is None else 7, version="1.4")
+    middle = np.round(scan.bounds.mean(axis=0)) if len(scan) else np.zeros(3)
+    header.scales, header.offsets = np.full(3, _STEP), middle
+    if len(scan) and float(np.abs(scan.points - middle).max()) / _STEP >= 2**31 - 1:
+        raise ExportError("too wide for LAS in steps of 0.1 mm", file=path, remedy="use .ply")
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = scan.points.T
+    if scan.intensity is not None:
+        # sixteen bits; shares of one are stretched over them
+        shares = len(scan) and float(np.nanmax(np.abs(scan.intensity))) <= 1.0
+        las.intensity = np.clip(np.nan_to_num(scan.intensity) * (65535.0 if shares else 1.0), 0, 65535)
+    if scan.colors is not None:
+        las.red, las.green, las.blue = (scan.colors.astype(np.uint16) * 257).T
+    las.write(path)

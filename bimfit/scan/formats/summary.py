@@ -27,13 +27,11 @@ def summary(scan: LineScan | PointCloud, form: str, unit: float) -> str:
     """
     if isinstance(scan, PointCloud):
         parts = [f"{len(scan):,} points"]
-        parts.append(
-            "sensor position unknown" if scan.viewpoint is None else f"seen from {_at(scan.viewpoint)}"
-        )
+        parts.append(seen_from(scan.viewpoint))
     else:
         silent = int(np.count_nonzero(~scan.returned))
         parts = [f"{len(scan):,} beams in {len(scan.sweeps):,} sweeps", f"{silent:,} without return"]
-        parts.append(_places(scan.origins))
+        parts.append(seen_from(scan.origins))
     parts.append(f"stored in {unit_name(unit)}")
     low, high = scan.bounds
     if np.isfinite(low).all():
@@ -41,17 +39,16 @@ def summary(scan: LineScan | PointCloud, form: str, unit: float) -> str:
     return f"{form}: {', '.join(parts)}"
 
 
-def _places(origins: Array) -> str:
-    """Where the sensor was."""
-    if not len(origins):
-        return "no sensor position"
-    move = np.flatnonzero((np.abs(np.diff(origins, axis=0)) > _SAME_PLACE).any(axis=1)) + 1
-    seen = np.unique(np.round(origins[np.r_[0, move]] / _SAME_PLACE), axis=0)
-    if len(seen) == 1:
-        return f"seen from {_at(origins[0])}"
+def seen_from(origins: Array | None) -> str:
+    """Where the sensor was: places of shape (3,) or (n, 3), a row a beam; None where that is not known."""
+    if origins is None or not origins.size:
+        return "sensor position unknown"
+    rows = origins.reshape(-1, 3)
+    move = np.flatnonzero((np.abs(np.diff(rows, axis=0)) > _SAME_PLACE).any(axis=1)) + 1
+    seen = np.unique(np.round(rows[np.r_[0, move]] / _SAME_PLACE), axis=0) * _SAME_PLACE
     if len(seen) <= _MOST_PLACES:
-        return "seen from " + " and ".join(_at(place * _SAME_PLACE) for place in seen)
-    return f"seen from {len(seen):,} places between {_at(origins.min(axis=0))} and {_at(origins.max(axis=0))}"
+        return "seen from " + " and ".join(map(_at, seen))
+    return f"seen from {len(seen):,} places between {_at(rows.min(axis=0))} and {_at(rows.max(axis=0))}"
 
 
 def _at(point: Array) -> str:
