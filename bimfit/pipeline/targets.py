@@ -141,15 +141,13 @@ def expected_viewpoint(slice_: Slice, section: JointSection) -> Array:
 
 
 def with_assumed_view(slice_: Slice, section: JointSection) -> Slice:
-    """A slice that does not know its sensor, of a joint that cannot be seen straight on.
+    """A slice that does not know its sensor, seen from 1 m out of the joint's open side.
 
-    A corner or a T is only ever seen from its open side, so that is where the sensor must have been; over a
-    joint that is open all round, the estimate finds or assumes the place by itself.
+    A corner or a T is only ever seen from there; over a joint that is open all round, that is straight above.
     """
     if slice_.viewpoint is not None:
         return slice_
-    out = aim(section, _FREE_VIEW)
-    return slice_ if out[0] == 0.0 else dataclasses.replace(slice_, viewpoint=_FAR_VIEW * out)
+    return dataclasses.replace(slice_, viewpoint=_FAR_VIEW * aim(section, _FREE_VIEW))
 
 
 def with_recovered_view(slices: Sequence[Slice]) -> tuple[Slice, ...]:
