@@ -40,6 +40,7 @@ def test_commands_of_the_readme_exist():
         "compare",
         "simulate",
         "view",
+        "report",
         "capture",
         "emulate",
         "live",

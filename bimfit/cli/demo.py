@@ -15,6 +15,7 @@ def run(
     ),
     joints: int = typer.Option(20, "--joints", min=1, help="Random joints in the accuracy table."),
     seed: int = typer.Option(0, "--seed", min=0, help="Seed of the first joint."),
+    report: bool = typer.Option(True, help="Write report.html."),
 ) -> int:
     """Scan the packaged joint virtually, fit it, measure its gap, and compare methods."""
     from bimfit.pipeline.demo import demo
@@ -22,7 +23,7 @@ def run(
 
     check_folder(output)
     with terminal_progress() as progress:
-        result = demo(output, joints=joints, seed=seed, progress=progress)
+        result = demo(output, joints=joints, seed=seed, report=report, progress=progress)
     print("Accuracy on the paper's reference scenario\n")
     print(result.accuracy)
     print(f"stations without an estimate: {result.lost}; estimates more than 10 mm off: {result.far}")

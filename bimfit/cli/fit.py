@@ -51,6 +51,7 @@ def run(
     sigma: str | None = typer.Option(None, "--sigma", help="The sensor's range noise, such as 3mm."),
     config: Path | None = typer.Option(None, "--config", metavar="FILE.toml", help="Settings."),
     pictures: bool = typer.Option(True, help="Draw pictures."),
+    report: bool = typer.Option(True, help="Write report.html."),
     as_built: bool = typer.Option(True, help="Write the model with the gaps as as-built.ifc."),
     move_elements: bool = typer.Option(
         False, "--move-elements", help="In as-built.ifc, put components where they are."
@@ -72,6 +73,7 @@ def run(
     )
     wanted = Deliverables(
         pictures=pictures,
+        report=report,
         as_built=as_built,
         move_elements=move_elements,
         limits=Limits() if limits is None else read_limits(limits),

@@ -11,7 +11,20 @@ from collections.abc import Iterator, Sequence
 import typer
 
 from bimfit import __version__
-from bimfit.cli import bench, capture, compare, convert, demo, emulate, fit, joints, live, simulate, view
+from bimfit.cli import (
+    bench,
+    capture,
+    compare,
+    convert,
+    demo,
+    emulate,
+    fit,
+    joints,
+    live,
+    report,
+    simulate,
+    view,
+)
 from bimfit.errors import BimfitError
 
 CACHE_OFF = "BIMFIT_NO_CACHE"
@@ -36,6 +49,7 @@ app.command("capture")(capture.run)
 app.command("emulate")(emulate.run)
 app.command("live")(live.run)
 app.command("view")(view.run)
+app.command("report")(report.run)
 app.command("bench")(bench.run)
 
 

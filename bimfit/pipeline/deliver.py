@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bimfit.bim.bcf import Version, check_bcf
 from bimfit.files import protect_inputs
 from bimfit.pipeline.as_built import try_write_model
 from bimfit.pipeline.document import read_results
-from bimfit.pipeline.issues import write_issues
+from bimfit.pipeline.issues import open_building, write_issues
 from bimfit.pipeline.limits import Limits
 from bimfit.pipeline.output import write_survey
 from bimfit.pipeline.pictures import write_pictures
 from bimfit.pipeline.records import SurveyResult
+from bimfit.pipeline.report import write_report
 from bimfit.pipeline.schedule import write_schedule
+
+if TYPE_CHECKING:
+    from bimfit.simulation.truth import JointTruth
 
 Progress = Callable[[str, float], None]
 
@@ -26,8 +31,8 @@ class Deliverables:
 
     Attributes
     ----------
-    pictures, as_built : bool
-        Pictures of the first joints; the model with the gaps.
+    pictures, report, as_built : bool
+        Pictures of the first joints; report.html; the model with the gaps.
     move_elements : bool
         Whether components stand where they are in the as-built model.
     limits : Limits
@@ -38,6 +43,7 @@ class Deliverables:
     """
 
     pictures: bool = True
+    report: bool = True
     as_built: bool = True
     move_elements: bool = False
     limits: Limits = field(default_factory=Limits)
@@ -59,9 +65,23 @@ def check_deliverables(wanted: Deliverables, model: Path, scan: Path) -> None:
 
 
 def deliver(
-    survey: SurveyResult, folder: Path, wanted: Deliverables, progress: Progress
+    survey: SurveyResult,
+    folder: Path,
+    wanted: Deliverables,
+    progress: Progress,
+    truths: Mapping[str, JointTruth] | None = None,
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """Write a run's results into its folder.
+
+    Parameters
+    ----------
+    survey : SurveyResult
+    folder : Path
+    wanted : Deliverables
+    progress : callable
+        Told (step, share done).
+    truths : mapping of str to JointTruth, optional
+        By joint id, drawn beside the estimates of a simulated scan.
 
     Returns
     -------
@@ -77,7 +97,7 @@ def deliver(
     """
     notes: list[str] = []
     progress("writing", 0.0)
-    files = [*write_survey(survey, folder)]
+    files = [*write_survey(survey, folder, limits=wanted.limits.given)]
     results = read_results(folder)
     tables, note = write_schedule(results, folder, wanted.limits)
     files += tables
@@ -89,7 +109,11 @@ def deliver(
         notes += notes_of_model
     if wanted.pictures:
         progress("drawing", 0.0)
-        files += write_pictures(survey, folder)
+        files += write_pictures(survey, folder, truths)
+    if wanted.report:
+        files.append(
+            write_report(results, folder, wanted.limits, building=survey.building, progress=progress)
+        )
     if wanted.bcf is not None:
         issues = write_issues(
             results,
@@ -103,3 +127,40 @@ def deliver(
         files.append(wanted.bcf)
         notes.append(f"{len(issues)} issue{'s' if len(issues) != 1 else ''} in {wanted.bcf}")
     return tuple(files), tuple(notes)
+
+
+def report_again(
+    folder: Path, limits: Limits | None, bcf: Path | None, bcf_version: str, progress: Progress
+) -> tuple[tuple[Path, ...], tuple[str, ...]]:
+    """Write report, schedule and perhaps issues of a results folder again.
+
+    Parameters
+    ----------
+    folder : Path
+    limits : Limits or None
+        None takes those of the fit.
+    bcf : Path or None
+    bcf_version : str
+    progress : callable
+
+    Returns
+    -------
+    files, notes
+        As of :func:`deliver`.
+
+    Raises
+    ------
+    BimfitError
+        When the folder holds no results, or something cannot be written.
+    """
+    version: Version = "2.1" if bcf is None else check_bcf(bcf, bcf_version)
+    results = read_results(folder)
+    rules = limits if limits is not None else Limits.of(results.limits)
+    building = open_building(results)
+    missing = "" if building is not None else f"the model {results.model} is no longer there to be drawn"
+    tables, note = write_schedule(results, folder, rules)
+    files = [*tables, write_report(results, folder, rules, building=building, progress=progress)]
+    if bcf is not None:
+        write_issues(results, folder, bcf, rules, building=building, version=version, progress=progress)
+        files.append(bcf)
+    return tuple(files), tuple(text for text in (note, missing) if text)

@@ -9,9 +9,8 @@ from pathlib import Path
 from bimfit.config import Config
 from bimfit.pipeline.accuracy import accuracy_table, joint_errors, table_text, time_text
 from bimfit.pipeline.compare import Comparison, comparison_table, run_methods, write_comparison
+from bimfit.pipeline.deliver import Deliverables, deliver
 from bimfit.pipeline.fit import fit_joint
-from bimfit.pipeline.output import write_survey
-from bimfit.pipeline.pictures import write_pictures
 from bimfit.pipeline.records import JointResult
 from bimfit.pipeline.samples import sample_model
 from bimfit.pipeline.simulate import designed, simulate
@@ -55,6 +54,7 @@ def demo(
     joints: int = 20,
     seed: int = 0,
     methods: Sequence[str] = METHODS,
+    report: bool = True,
     progress: Progress = lambda step, share: None,
 ) -> DemoResult:
     """Run the paper's experiment: files and pictures for one joint, accuracy over many, methods side by side.
@@ -67,6 +67,8 @@ def demo(
         How many random joints the accuracy table is over.
     seed : int
         Of the first; the k-th uses ``seed + k``.
+    report : bool
+        Whether report.html is written.
     """
     model_path, config, scenario = sample_model(SAMPLE), Config(), Scenario()
     progress("simulating a scan", 0.0)
@@ -75,9 +77,8 @@ def demo(
     write_scan(scan, scan_path)
     write_truth(truths, truth_path, model=model_path, scan=scan_path)
     result = survey(model_path, scan_path, config, joints=[truths[0].id], progress=progress)
-    files = [*write_survey(result, folder)]
-    progress("drawing", 0.0)
-    files += write_pictures(result, folder, {truths[0].id: truths[0]})
+    written, _ = deliver(result, folder, Deliverables(report=report), progress, {truths[0].id: truths[0]})
+    files = [*written]
     fits, errors = accuracy_run(model_path, scenario, config, range(seed, seed + joints), progress)
     model, found = model_joints(model_path, config.joints, [truths[0].id])
     cut = cut_joint(model, found[0], scan, config)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -139,6 +140,8 @@ class ResultsDocument:
     model, scan : str
     notes : tuple of str
     joints : tuple of JointDocument
+    limits : mapping of str to (float, float)
+        What joints might measure when they were fitted, m; infinite where an end is open.
     """
 
     version: str
@@ -146,6 +149,7 @@ class ResultsDocument:
     scan: str
     notes: tuple[str, ...]
     joints: tuple[JointDocument, ...]
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def read_results(folder: Path) -> ResultsDocument:
@@ -174,6 +178,7 @@ def read_results(folder: Path) -> ResultsDocument:
             scan=str(value["scan"]),
             notes=tuple(str(note) for note in value.get("notes", ())),
             joints=tuple(_joint(joint) for joint in value["joints"]),
+            limits={str(name): _range(pair) for name, pair in (value.get("limits") or {}).items()},
         )
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         reason = f"lacks {error}" if isinstance(error, KeyError) else f"cannot be used: {error}"
@@ -228,6 +233,11 @@ def _station(value: Mapping[str, Any]) -> StationDocument:
         contact=str(gap.get("contact", "")),
         polygon=_rows(gap.get("polygon")),
     )
+
+
+def _range(value: Any) -> tuple[float, float]:
+    low, high = value
+    return -math.inf if low is None else float(low), math.inf if high is None else float(high)
 
 
 def _pair(value: Any) -> tuple[str, str]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
+from bimfit.errors import ConfigError
 from bimfit.geometry.pose import Array
 from bimfit.pipeline.document import JointDocument, StationDocument
 
@@ -46,6 +47,20 @@ class Limits:
     narrowest: Range | None = None
     deviation: Range | None = None
     step: Range | None = None
+
+    @classmethod
+    def of(cls, ranges: Mapping[str, Range]) -> Limits:
+        """Limits by name.
+
+        Raises
+        ------
+        ConfigError
+            For a name that is none; says which there are.
+        """
+        for name in ranges:
+            if name not in _WORDS:
+                raise ConfigError(f"there is no limit called {name}", remedy=f"there are {', '.join(_WORDS)}")
+        return cls(**ranges)
 
     @property
     def given(self) -> dict[str, Range]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +23,11 @@ MESH_FORMATS = ("glb", "stl", "ply", "obj", "3mf")
 
 
 def write_survey(
-    survey: SurveyResult, folder: Path, *, formats: Sequence[str] = MESH_FORMATS
+    survey: SurveyResult,
+    folder: Path,
+    *,
+    formats: Sequence[str] = MESH_FORMATS,
+    limits: Mapping[str, tuple[float, float]] | None = None,
 ) -> tuple[Path, ...]:
     """Write meshes, stations.csv and, last, results.json.
 
@@ -34,6 +38,8 @@ def write_survey(
         Made when it is not there; files of an earlier run that this run does not write again are removed.
     formats : sequence of str
         Mesh formats, the first of which results.json names as ``mesh``.
+    limits : mapping, optional
+        What joints may measure, kept in results.json.
 
     Returns
     -------
@@ -53,7 +59,7 @@ def write_survey(
     stale = _earlier_files(folder) - set(planned) - {survey.model.absolute(), survey.scan.absolute()}
     files = {i: _write_meshes(i, mesh, folder, formats) for i, mesh in meshes.items()}
     write_text(folder / "stations.csv", stations_to_csv(survey.joints))
-    write_text(folder / "results.json", to_json(survey_to_dict(survey, files)))
+    write_text(folder / "results.json", to_json(survey_to_dict(survey, files, limits)))
     for path in stale:
         path.unlink(missing_ok=True)
     return tuple(planned)

@@ -25,7 +25,11 @@ if TYPE_CHECKING:
 SCHEMA = 1
 
 
-def survey_to_dict(survey: SurveyResult, meshes: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def survey_to_dict(
+    survey: SurveyResult,
+    meshes: Mapping[str, Mapping[str, Any]],
+    limits: Mapping[str, tuple[float, float]] | None = None,
+) -> dict[str, Any]:
     """The whole run as results.json holds it.
 
     Parameters
@@ -33,6 +37,8 @@ def survey_to_dict(survey: SurveyResult, meshes: Mapping[str, Mapping[str, Any]]
     survey : SurveyResult
     meshes : mapping
         For each joint id: ``mesh`` (file name) and what else is known of its files, such as ``offset``.
+    limits : mapping, optional
+        What joints may measure, m, by :class:`bimfit.pipeline.limits.Limits`' names; null is an open end.
     """
     return {
         "schema": SCHEMA,
@@ -42,6 +48,7 @@ def survey_to_dict(survey: SurveyResult, meshes: Mapping[str, Mapping[str, Any]]
         "units": {"length": "m", "angle": "rad"},
         "notes": list(survey.notes),
         "placing": dict(survey.placing),
+        "limits": dict(limits) if limits else None,
         "joints": [_joint(joint, survey.building, meshes.get(joint.joint.id, {})) for joint in survey.joints],
     }
 

@@ -90,6 +90,8 @@ def plot_limits(
     ExportError
         When it cannot be written.
     """
+    from matplotlib import rc_context
+
     rows = len(series) + (picture is not None)
     ratios = ([2.2] if picture is not None else []) + [1.0] * len(series)
     figure = new_figure(width, 1.7 * sum(ratios) + 0.4)
@@ -113,7 +115,8 @@ def plot_limits(
         borderaxespad=0.0,
     )
     heading(figure, title)
-    return save(figure, path)
+    with rc_context({"svg.fonttype": "none"}):  # letters as text: a third of the size
+        return save(figure, path)
 
 
 def _draw(ax: Axes, series: LimitSeries) -> None:
