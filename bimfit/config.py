@@ -155,6 +155,9 @@ class FitConfig:
         Half window of a component's own search is never less than this, m.
     component_angle : float
         Half window of a component's own search in theta, rad.
+    joint_sigma : float
+        Standard deviation of the joint's place as a whole about its design, m: it decides between gaps in
+        the scan that look alike.
     reach : float
         How far from the joint the cross-sections are used, m.
     min_points : int
@@ -165,11 +168,13 @@ class FitConfig:
     gap_fraction: float = 0.5
     placement_tolerance: float = 0.0125
     component_angle: float = math.radians(6.0)
+    joint_sigma: float = 0.020
     reach: float = 0.2
     min_points: int = 6
 
     def __post_init__(self) -> None:
         _positive(self, "placement_sigma", "gap_fraction", "placement_tolerance", "component_angle", "reach")
+        _positive(self, "joint_sigma")
         if self.min_points < 3:
             raise ConfigError(f"min_points must be at least 3, got {self.min_points}")
 

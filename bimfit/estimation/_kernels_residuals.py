@@ -72,6 +72,7 @@ def residuals(
     out: Array,
     z: Array,
     places: Array,
+    faces: Ints,
 ) -> int:
     """Residuals of the returns on a component, and what they say of it.
 
@@ -88,17 +89,16 @@ def residuals(
     out : (FIGURES,) out
         Beams, covered, inliers, rms, chi2, outlier share, miss share, their longest runs, cumulated
         range, lag 1, unexplained, edge; in the order of :class:`~bimfit.estimation.result.Residuals`.
-    z, places : (n,), (n, 2) out
-        Residuals and places of the inliers.
+    z, places, faces : (n,), (n, 2), (n,) out
+        Residuals and places of the inliers, and the edge of each.
 
     Returns
     -------
     int
-        How many rows of ``z`` and ``places`` are filled.
+        How many rows of ``z``, ``places`` and ``faces`` are filled.
     """
     n = r.shape[0]
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    faces = np.empty(n, np.int64)
     stray, missed = np.empty(n, np.bool_), np.empty(n, np.bool_)
     beams = covered = quiet_all = quiet = count = strays = misses = 0
     for q in range(eye.shape[0]):

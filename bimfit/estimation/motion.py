@@ -229,7 +229,7 @@ def _gains(
         S = np.einsum("ic,iab->cab", ramps**2, L, optimize=True)
         cross = np.einsum("ic,iab,ibf->caf", ramps, L, design, optimize=True)
         S = S - np.einsum("caf,fg,cbg->cab", cross, cov, cross, optimize=True)
-        S[:, [0, 1, 2], [0, 1, 2]] *= 1.0 + 1e-9
+        S[:, [0, 1, 2], [0, 1, 2]] += 1e-3 + 1e-9 * S[:, [0, 1, 2], [0, 1, 2]]  # as in solve()
         out += np.einsum("ca,ca->c", g, np.linalg.solve(S, g[:, :, None])[:, :, 0])
     return out
 

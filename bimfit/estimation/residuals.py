@@ -39,12 +39,13 @@ def residuals_of(
     """
     n = len(beams)
     out, z, places = np.empty(kernels.FIGURES), np.empty(n), np.empty((n, 2))
+    faces = np.empty(n, np.int64)
     count = kernels.residuals(
         rows, posterior.pose.as_array(), posterior.pivot, posterior.pivot_covariance, met[0], met[1], other,
-        used.copy(), beams.d, beams.r, beams.start, beams.eye, beams.spacing, sigma, out, z, places,
+        used.copy(), beams.d, beams.r, beams.start, beams.eye, beams.spacing, sigma, out, z, places, faces,
     )  # fmt: skip
     f = out.tolist()
     return Residuals(
         int(f[0]), int(f[1]), int(f[2]), f[3], f[4], f[5], f[6], int(f[7]), int(f[8]), f[9], f[10],
-        int(f[11]), f[12], z[:count], places[:count],
+        int(f[11]), f[12], z[:count], places[:count], faces[:count],
     )  # fmt: skip

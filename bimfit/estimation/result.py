@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bimfit.config import SensorConfig
 from bimfit.estimation.posterior import Posterior
@@ -37,7 +38,9 @@ class Residuals:
     edge : float
         How far the last returns at an end of the main face lie behind it, in standard deviations.
     residuals, places : ndarray, shape (n_inliers,) and (n_inliers, 2)
-        Residuals, m, and where on the designed component they lie.
+        Residuals in range, m, and where the returns lie in the section.
+    faces : ndarray, shape (n_inliers,)
+        The edge of the component's profile that each should have met.
     """
 
     n_beams: int = 0
@@ -55,6 +58,7 @@ class Residuals:
     edge: float = 0.0
     residuals: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     places: Array = field(default_factory=lambda: np.zeros((0, 2)), repr=False)
+    faces: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64), repr=False)
 
 
 @dataclass(frozen=True)

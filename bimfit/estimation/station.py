@@ -12,7 +12,9 @@ import numpy as np
 from bimfit.config import FitConfig, SensorConfig
 from bimfit.estimation import checks
 from bimfit.estimation.cloud import irregular_sensor, virtual_beams
+from bimfit.estimation.inside import with_inside
 from bimfit.estimation.likelihood import BeamModel, BeamSet, edge_rows
+from bimfit.estimation.lookalikes import gap_places, with_lookalikes
 from bimfit.estimation.ownership import (
     Cost,
     Ints,
@@ -135,20 +137,41 @@ def _estimated(
         beams = BeamSet.of(slice_.beams)
     rows = (edge_rows(section.components[0]), edge_rows(section.components[1]))
     context = _Context(section, beams, rows, BeamModel.of(sensor), sensor, fit, virtual is not None)
-    slid, cost = _place(context, combined, rivals)
     reason = virtual.reason if virtual else ""
-    best = _components(context, slice_, slid, cost, component_matches, reason)
-    if slid.rival is None or slid.rival_odds < _WORTH_A_LOOK:
+    best, cost = _placed(context, slice_, combined, component_matches, rivals, reason)
+    best = with_inside(best, section, beams, sensor.sigma, slice_.sweeps)
+    if not best.status.measured or best.combined is None:
         return best
+    others = []
+    for place in gap_places(section, beams, best.combined):
+        there = best_start(section, beams, cost, (place,), sensor, fit)
+        other = _components(context, slice_, there, cost, (None, None), reason)
+        others.append(with_inside(other, section, beams, sensor.sigma, slice_.sweeps))
+    return with_lookalikes(best, others, fit.joint_sigma)
+
+
+def _placed(
+    context: _Context,
+    slice_: Slice,
+    combined: Pose2D,
+    matches: tuple[Pose2D | None, Pose2D | None],
+    rivals: Sequence[Pose2D],
+    reason: str,
+) -> tuple[StationEstimate, Cost]:
+    """The best estimate near the combined pose and its rivals, and what covering a beam costs."""
+    slid, cost = _place(context, combined, rivals)
+    best = _components(context, slice_, slid, cost, matches, reason)
+    if slid.rival is None or slid.rival_odds < _WORTH_A_LOOK:
+        return best, cost
     # the slide's blur cannot tell the two apart for certain; both fitted at the sensor's sigma can
     turned = dataclasses.replace(slid, pose=slid.rival, rival=slid.pose)
     other = _components(context, slice_, turned, cost, (None, None), reason)
     odds = _evidence(other) - _evidence(best)
     if best.status.measured and not other.status.measured:
-        return best  # what explains more by being impossible is no rival
+        return best, cost  # what explains more by being impossible is no rival
     if odds > 0.0 or (other.status.measured and not best.status.measured):
         best, odds = other, -abs(odds)
-    return checks.with_rival(best, odds)
+    return checks.with_rival(best, odds), cost
 
 
 def _evidence(estimate: StationEstimate) -> float:

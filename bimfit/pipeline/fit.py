@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from bimfit.config import Config, SearchConfig, SensorConfig
 from bimfit.errors import ConfigError
+from bimfit.estimation.company import with_company
 from bimfit.estimation.motion import estimate_joint
 from bimfit.estimation.noise import Noise, estimate_noise
 from bimfit.estimation.result import StationEstimate
@@ -111,6 +112,7 @@ def fit_joint(
     if method == "grcsm":
         noise = estimate_noise([fit.estimate for fit in fits if fit.estimate is not None], config.sensor)
         fits = _with_noise(fits, noise, config)
+        fits = _with_company(fits, noise)
         fits, motion = _along_the_joint(fits, motion)
     else:
         motion = "independent"
@@ -224,6 +226,13 @@ def _differs(found: SensorConfig, assumed: SensorConfig) -> bool:
         or abs(found.outlier_share - assumed.outlier_share) > _OTHER_SHARE
         or abs(found.miss_share - assumed.miss_share) > _OTHER_SHARE
     )
+
+
+def _with_company(fits: list[StationFit], noise: Noise) -> list[StationFit]:
+    """Flag what only the joint as a whole can tell: a bend, another shape, a fit amid misfits."""
+    estimates = [fit.estimate for fit in fits if fit.estimate is not None]
+    judged = with_company(estimates, [fit.section for fit in fits], noise.correlation)
+    return [dataclasses.replace(f, estimate=e) for f, e in zip(fits, judged, strict=True)]
 
 
 def _along_the_joint(fits: list[StationFit], motion: str) -> tuple[list[StationFit], str]:

@@ -1,0 +1,69 @@
+"""What a joint's stations say of one another: a shape that no slice alone can tell, and bad company."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from bimfit.estimation.departure import Departure, departure
+from bimfit.estimation.result import StationEstimate
+from bimfit.geometry.joint_section import JointSection
+from bimfit.geometry.status import Status
+
+_SURE = 4.0
+"""Standard deviations from which on pooled residuals are no accident."""
+_NEIGHBOURS, _MOSTLY = 6, 0.6
+
+
+def with_company(
+    stations: Sequence[StationEstimate], sections: Sequence[JointSection], correlation: float = 0.0
+) -> tuple[StationEstimate, ...]:
+    """The stations, ``weak`` where the joint as a whole contradicts what one slice cannot see.
+
+    Parameters
+    ----------
+    stations, sections : sequence
+        One a station, in the order of the joint, each estimated by itself.
+    correlation : float
+        Of neighbouring beams' noise.
+    """
+    departures = [departure(stations, sections, which, correlation=correlation) for which in (0, 1)]
+    reasons = [_reason(d) for d in departures]
+    rejected = [e.status.name == "rejected" for e in stations]
+    out = []
+    for i, station in enumerate(stations):
+        around = [rejected[k] for k in range(max(0, i - _NEIGHBOURS), min(len(stations), i + _NEIGHBOURS + 1))]
+        if station.status.name == "ok" and sum(around) > _MOSTLY * (len(around) - 1) and len(around) > 3:
+            bad = sum(around)
+            reason = f"{bad} of the {len(around) - 1} stations around it do not fit the design"
+            out.append(replace(station, status=Status("weak", reason)))
+            continue
+        out.append(_with_shape(station, reasons))
+    return tuple(out)
+
+
+def departs(found: Departure) -> bool:
+    """Whether a component's shape is another than designed, by its residuals pooled along the joint."""
+    return found.freedom > 0 and (abs(found.bow) > _SURE or found.score > _SURE)
+
+
+def _reason(found: Departure) -> str:
+    if not departs(found):
+        return ""
+    what = "bent" if abs(found.bow) > _SURE else "of another shape"
+    return (
+        f"pooled along the joint, its surface is {what}: up to {abs(found.worst) * 1e3:.1f} mm "
+        f"{'in front of' if found.worst > 0.0 else 'behind'} the designed one"
+    )
+
+
+def _with_shape(station: StationEstimate, reasons: Sequence[str]) -> StationEstimate:
+    components = [
+        replace(c, status=Status("weak", reason)) if reason and c.status.name == "ok" else c
+        for c, reason in zip(station.components, reasons, strict=True)
+    ]
+    status = station.status
+    for name, reason in zip("AB", reasons, strict=True):
+        if reason and status.name == "ok":
+            status = Status("weak", f"component {name}: {reason}")
+    return replace(station, components=(components[0], components[1]), status=status)
