@@ -32,7 +32,9 @@ def with_company(
     rejected = [e.status.name == "rejected" for e in stations]
     out = []
     for i, station in enumerate(stations):
-        around = [rejected[k] for k in range(max(0, i - _NEIGHBOURS), min(len(stations), i + _NEIGHBOURS + 1))]
+        around = [
+            rejected[k] for k in range(max(0, i - _NEIGHBOURS), min(len(stations), i + _NEIGHBOURS + 1))
+        ]
         if station.status.name == "ok" and sum(around) > _MOSTLY * (len(around) - 1) and len(around) > 3:
             bad = sum(around)
             reason = f"{bad} of the {len(around) - 1} stations around it do not fit the design"

@@ -25,6 +25,7 @@ _LEAST = 12
 _SHARE = 0.05
 """Share of the returns that a face needs to be looked at."""
 _FEWEST = 4
+_CLEAR = 2.0
 
 
 @dataclass(frozen=True)
@@ -102,8 +103,12 @@ def departure(
         if c.pose is None or len(c.residuals.places) < _LEAST:
             continue
         faces = c.residuals.faces
-        at = on_outline(section.components[which], c.pose.inverse().apply(c.residuals.places), faces)
-        parts.append((faces, *at))
+        along, clear, *at = on_outline(
+            section.components[which], c.pose.inverse().apply(c.residuals.places), faces
+        )
+        # near an edge, a beam that meets the other face is taken for one of this
+        keep = clear > _CLEAR * station.sensor.sigma
+        parts.append((faces[keep], along[keep], *(column[keep] for column in at)))
     if not parts:
         return NOTHING
     faces, along, offset, places, normals = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -114,7 +119,7 @@ def departure(
 
 
 def _groups(faces: Ints, along: Array, bins: int) -> list[Ints]:
-    """Returns in bins of about equal count, none across an edge of the outline; faces hardly seen left out."""
+    """Returns in bins of about equal count, none across two faces; faces hardly seen are left out."""
     names, counts = np.unique(faces, return_counts=True)
     seen = counts >= max(_SHARE * counts.sum(), 2 * _LEAST)
     out: list[Ints] = []
@@ -126,7 +131,7 @@ def _groups(faces: Ints, along: Array, bins: int) -> list[Ints]:
     return out
 
 
-def on_outline(profile: Profile, points: Array, faces: Ints) -> tuple[Array, Array, Array, Array]:
+def on_outline(profile: Profile, points: Array, faces: Ints) -> tuple[Array, Array, Array, Array, Array]:
     """Where on a profile's outline points lie that are known to belong to certain edges.
 
     Parameters
@@ -138,8 +143,9 @@ def on_outline(profile: Profile, points: Array, faces: Ints) -> tuple[Array, Arr
 
     Returns
     -------
-    along, offset : ndarray, shape (m,)
-        Distance along the outline, and in front of its surface (outward positive), m.
+    along, clear, offset : ndarray, shape (m,)
+        Distance along the outline, from the nearer end of the edge, and in front of its surface (outward
+        positive), m.
     places, normals : ndarray, shape (m, 2)
         The foot of each point on its edge, and the outward normal there.
     """
@@ -150,7 +156,8 @@ def on_outline(profile: Profile, points: Array, faces: Ints) -> tuple[Array, Arr
     a, d, normal = edges[faces, 0], d[faces] / size[faces, None], profile.normals[faces]
     w = points - a
     t = (w * d).sum(axis=1)
-    return start[faces] + t, np.asarray((w * normal).sum(axis=1)), a + t[:, None] * d, normal
+    clear = np.minimum(t, size[faces] - t)
+    return start[faces] + t, clear, np.asarray((w * normal).sum(axis=1)), a + t[:, None] * d, normal
 
 
 def _binned(

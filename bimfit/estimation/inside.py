@@ -1,4 +1,4 @@
-"""Returns from inside the gap, where the design leaves it open: a bevel, a bead, a filler, or no gap at all."""
+"""Returns from inside the gap, where the design leaves it open: a bevel, a bead, a filler or no gap."""
 
 from __future__ import annotations
 
@@ -40,7 +40,9 @@ def returns_inside(
     sigma : float
         Of a range, m.
     """
-    a, b = (pose.apply(side) for pose, side in zip(poses, (section.gap.side_a, section.gap.side_b), strict=True))
+    a, b = (
+        pose.apply(side) for pose, side in zip(poses, (section.gap.side_a, section.gap.side_b), strict=True)
+    )
     ring = np.concatenate([a, b[::-1]])
     points = beams.points
     low, high = ring.min(axis=0), ring.max(axis=0)
@@ -60,7 +62,11 @@ def returns_inside(
         for shift in (np.zeros(2), closer):
             there = Pose2D(pose.u + float(shift[0]), pose.v + float(shift[1]), pose.theta)
             least = np.minimum(least, predict_ranges(edge_rows(component, there), chosen)[0])
-    return int((least > chosen.r + _SAME * sigma).sum())
+    loose = least > chosen.r + _SAME * sigma
+    for side, sd in zip((a, b), spread, strict=True):
+        # what lies on a side itself, deep in the gap where a beam grazes it, is the component
+        loose &= distance_to_chain(chosen.points, side) > _SURE * sd + beams.spacing * reach
+    return int(loose.sum())
 
 
 def within(points: Array, ring: Array) -> Mask:
@@ -130,7 +136,9 @@ def with_inside(
     most = _DROP[min(inside, len(_DROP) - 1)]
     if drop <= most:
         return station
-    reason = "the components' edges at the mouth are not shaped as designed: their surfaces drop off before them"
+    reason = (
+        "the components' edges at the mouth are not shaped as designed: their surfaces drop off before them"
+    )
     if inside:
         reason = f"{count} returns come from inside the gap, where the design has nothing"
     return replace(station, status=Status("rejected", reason))

@@ -67,12 +67,16 @@ class Tally:
 
 
 def bench_refusal(
-    joints: int, seed: int, progress: Progress, scenes: Sequence[str] = (TRUE, *IMPOSTORS)
+    joints: int,
+    seed: int,
+    progress: Progress,
+    scenes: Sequence[str] = (TRUE, *IMPOSTORS),
+    spacing: float = 0.010,
 ) -> tuple[str, dict[str, Any]]:
-    """Every scene at so many seeded joints of 83 slices, clean and degraded; text and data."""
+    """Every scene at so many seeded joints (83 slices at 10 mm), clean and degraded; text and data."""
     model, found = model_joints(sample_model(REFERENCE), Config().joints)
     joint = longest_open(found)
-    base = Scenario()
+    base = Scenario(spacing=spacing)
     sections = designed(model, joint, base)
     tallies: dict[str, dict[str, Tally]] = {}
     for k in range(joints):

@@ -1,4 +1,4 @@
-"""Scenes that are not the designed joint, or not quite: what an estimate has to refuse (METHOD, section 5)."""
+"""Scenes that are not the designed joint, or not quite: what is to be refused (METHOD, section 5)."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def _clutter(rng: Random) -> Maker:
 
 
 def _bevel(rng: Random) -> Maker:
-    """A V-groove of the designed mouth's width, closed at its root but for 4 mm, where the design is square."""
+    """A V-groove of the designed mouth's width, 4 mm open at its root, where the design is square."""
     land, root = 0.003, 0.002
 
     def make(section: JointSection) -> Pair:
@@ -125,7 +125,8 @@ def _beside(count: int, width: float) -> Callable[[Random], Maker]:
             loops: tuple[list[Array], list[Array]] = ([], [])
             for k in range(-before - 1, count - before - 1):
                 left = 0.5 * gap + k * (gap + width)
-                tilt = Pose2D.about((left, high), *rng.uniform(-0.002, 0.002, 2), rng.uniform(-0.02, 0.02))
+                du, dv, turn = (rng.uniform(-1.0, 1.0, 3) * (0.002, 0.002, 0.02)).tolist()
+                tilt = Pose2D.about((left, high), du, dv, turn)
                 own = k in (-1, 0)
                 board = box(left, left + width, low, high)
                 loops[0 if k < 0 else 1].append((board if own else board.moved(tilt)).loops[0])
