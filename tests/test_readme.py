@@ -41,6 +41,7 @@ def test_commands_of_the_readme_exist():
         "simulate",
         "view",
         "report",
+        "convert",
         "capture",
         "emulate",
         "live",

@@ -81,7 +81,8 @@ def run(
         bcf_version=bcf_version,  # type: ignore[arg-type]  # checked below
     )
     check_folder(output)
-    check_deliverables(wanted, model, scan)
+    inputs = [model, scan, *(path for path in (config, choice.pairs) if path is not None)]
+    check_deliverables(wanted, output, inputs)
     with terminal_progress() as progress:
         result = survey(
             model,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 from bimfit.bim.bcf import Version, check_bcf
 from bimfit.files import protect_inputs
 from bimfit.pipeline.as_built import try_write_model
-from bimfit.pipeline.document import read_results
+from bimfit.pipeline.document import ResultsDocument, read_results
 from bimfit.pipeline.issues import open_building, write_issues
-from bimfit.pipeline.limits import Limits
-from bimfit.pipeline.output import write_survey
+from bimfit.pipeline.limits import Limits, judge
+from bimfit.pipeline.output import DERIVED, write_survey
 from bimfit.pipeline.pictures import write_pictures
 from bimfit.pipeline.records import SurveyResult
 from bimfit.pipeline.report import write_report
@@ -51,17 +51,19 @@ class Deliverables:
     bcf_version: Version = "2.1"
 
 
-def check_deliverables(wanted: Deliverables, model: Path, scan: Path) -> None:
-    """See that all of it could be written, before a long run.
+def check_deliverables(wanted: Deliverables, folder: Path, inputs: Sequence[Path]) -> None:
+    """See that all of it could be written, and in place of no input, before a long run.
 
     Raises
     ------
     BimfitError
         When it could not.
     """
+    fixed = ("results.json", "stations.csv", *DERIVED)
+    protect_inputs([folder / name for name in fixed], inputs)
     if wanted.bcf is not None:
         check_bcf(wanted.bcf, wanted.bcf_version)
-        protect_inputs([wanted.bcf], [model, scan])
+        protect_inputs([wanted.bcf], inputs)
 
 
 def deliver(
@@ -114,6 +116,8 @@ def deliver(
         files.append(
             write_report(results, folder, wanted.limits, building=survey.building, progress=progress)
         )
+    if wanted.limits.given:
+        notes.append(_told(results, wanted.limits))
     if wanted.bcf is not None:
         issues = write_issues(
             results,
@@ -127,6 +131,18 @@ def deliver(
         files.append(wanted.bcf)
         notes.append(f"{len(issues)} issue{'s' if len(issues) != 1 else ''} in {wanted.bcf}")
     return tuple(files), tuple(notes)
+
+
+def _told(results: ResultsDocument, limits: Limits) -> str:
+    """How the joints keep their limits, in a line."""
+    outcomes = {joint.id: judge(joint, limits).outcome for joint in results.joints}
+    parts = []
+    for outcome in ("pass", "fail", "not measured"):
+        names = [name for name, found in outcomes.items() if found == outcome]
+        some = f"{', '.join(names[:8])}{', ...' if len(names) > 8 else ''}"
+        listed = f" ({some})" if outcome == "fail" and names else ""
+        parts.append(f"{len(names)} {outcome}{listed}")
+    return f"limits ({limits}): {', '.join(parts)}"
 
 
 def report_again(

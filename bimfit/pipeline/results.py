@@ -122,7 +122,8 @@ def _search(match: MatchResult, frame: SectionFrame) -> dict[str, Any]:
         "bound": match.bound,
         "evaluations": match.evaluations,
         "levels": list(match.levels),
-        "stop": match.stop,
+        # nothing stopped where nothing was searched
+        "stop": match.stop if match.found or match.evaluations else None,
         "fitness": match.fitness,
         "inlier_rmse": match.inlier_rmse,
         "modes": [{"pose": mode.parameters, "score": mode.score} for mode in match.modes],
@@ -263,7 +264,9 @@ def _row(joint: JointResult, station: StationResult) -> dict[str, Any]:
                 f"{name}_theta_rad": component.pose.theta,
             }
     if station.combined is not None:
-        row |= {"search_stop": station.combined.stop, "evaluations": station.combined.evaluations}
+        row["evaluations"] = station.combined.evaluations
+        if station.combined.found or station.combined.evaluations:
+            row["search_stop"] = station.combined.stop
     gap = station.gap
     if gap is not None:
         row |= {

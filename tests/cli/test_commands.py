@@ -54,7 +54,7 @@ SEARCH = {
     "required": ["transform", "score", "bound", "evaluations", "stop"],
     "properties": {
         "transform": MATRIX,
-        "stop": {"enum": ["proven", "tolerance", "budget", "converged", "unproven"]},
+        "stop": {"enum": ["proven", "tolerance", "budget", "converged", "unproven", None]},
     },
 }
 COMPONENT = {
