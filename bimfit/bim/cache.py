@@ -32,7 +32,7 @@ DAMAGE = (
 )
 """What reading a damaged file of the cache may raise."""
 
-_VERSION = 1
+_VERSION = 2
 _MOST_BYTES = 2 << 30
 
 

@@ -31,6 +31,12 @@ _OPENING_RATE = 1e-6  # s a byte, beyond the time limit
 _ITEM_RATE = 0.02
 _LEAST_MEMORY = 4 << 30
 
+_SAID = {
+    "Syntax error": "its data is not well-formed (STEP, ISO 10303-21); export it again",
+    "Unable to parse IFC SPF header": "its header is damaged; export it again",
+}
+"""What the parser says, and what that means to its user."""
+
 Message = tuple[dict[str, Any], bytes]
 
 
@@ -159,6 +165,9 @@ def _mesh(head: dict[str, Any], payload: bytes) -> TriangleMesh:
 
 def _plain(message: str) -> str:
     kind, _, text = message.partition(": ")
+    for said, plain in _SAID.items():
+        if said in text:
+            return plain
     return text or kind
 
 

@@ -16,6 +16,13 @@ _HEAD = 1 << 16
 _LARGEST = 2 << 30
 _LARGEST_RATIO = 200
 _SCHEMA = re.compile(rb"FILE_SCHEMA\s*\(\s*\(\s*'([^']*)'", re.IGNORECASE)
+_END = b"END-ISO-10303-21"
+_TAIL = 4096
+# subtypes of IFC4 without attributes of their own, which IFC4X3 has no more
+_CASES = re.compile(
+    rb"(=\s*IFC(?:BEAM|COLUMN|DOOR|MEMBER|OPENING|PLATE|SLAB|WALL|WINDOW))(?:STANDARD|ELEMENTED)CASE(?=\s*\()"
+)
+_LONGEST_NAME = 40
 _READABLE = ("IFC2X3", "IFC4", "IFC4X3_ADD2")
 
 
@@ -82,12 +89,16 @@ def read_source(path: str | Path) -> Source:
     nearest = nearest_schema(schema)
     if nearest is None:
         raise ModelError(
-            f"is of schema {schema or 'unknown'}, which is not IFC2X3, IFC4 or IFC4X3", file=file
+            f"is of schema {_printable(schema) or 'unknown'}, which is not IFC2X3, IFC4 or IFC4X3", file=file
         )
     if named.group(1) != nearest.encode():
         data = data[: named.start(1)] + nearest.encode() + data[named.end(1) :]
         if schema != nearest:
             notes.append(f"schema {schema} was read as {nearest}")
+        if schema.startswith(("IFC4X1", "IFC4X2")):
+            data = _CASES.sub(rb"\1", data)
+    if _END not in data[-_TAIL:].upper():
+        notes.append(f"the file does not end as it should ({_END.decode()}): it may be cut off")
     digest = hashlib.sha256(data).hexdigest()
     return Source(file, data, data is raw, digest, schema, tuple(notes))
 
@@ -101,6 +112,11 @@ def nearest_schema(name: str) -> str | None:
     if name.startswith(("IFC4X1", "IFC4X2", "IFC4X3")):
         return "IFC4X3_ADD2"
     return "IFC4" if re.fullmatch(r"IFC4(_.*)?", name) else None
+
+
+def _printable(name: str) -> str:
+    short = "".join(c for c in name if c.isprintable())
+    return short if len(short) <= _LONGEST_NAME else f"{short[:_LONGEST_NAME]}..."
 
 
 def _check_kind(data: bytes, file: Path) -> None:

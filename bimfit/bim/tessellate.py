@@ -10,16 +10,19 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import sys
+from collections import Counter
+from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
 from bimfit.bim.georeference import map_scale
-from bimfit.geometry.pose import Array
+from bimfit.bim.winding import welded, wound_outwards
 
 _NO_ELEMENTS = ("IfcFeatureElement", "IfcVirtualElement")
-_WELD = 1e-6
+_KEYWORD = re.compile(rb"#\d+\s*=\s*([A-Za-z]\w*)\s*\(")
 _FAR = 1e8
 
 
@@ -44,7 +47,9 @@ def _serve(request: dict[str, Any], out: BinaryIO) -> None:
     model = ifcopenshell.open(request["path"])
     products = _products(model, request["include"])
     if request["index"]:
-        _send(out, {"kind": "index", **_index(model, products)})
+        index = _index(model, products)
+        index["notes"] += _unknown(request["path"], model)
+        _send(out, {"kind": "index", **index})
     left = {i: e for i, e in products.items() if i not in set(request["done"])}
     _send(out, {"kind": "begin", "count": len(left)})
     if request["one_by_one"]:
@@ -111,37 +116,14 @@ def _send_shape(shape: Any, number: int, out: BinaryIO) -> None:
             {"kind": "failed", "id": number, "reason": "has coordinates that are not finite or absurdly far"},
         )
     else:
-        kept, corners = _welded(local, faces)
+        kept, corners = welded(local, faces)
         if not len(corners):
             _send(out, {"kind": "failed", "id": number, "reason": "has a body without faces"})
             return
         vertices = np.ascontiguousarray(world[kept])
-        corners = np.ascontiguousarray(_outward(vertices - vertices.mean(axis=0), corners), np.int32)
+        corners = np.ascontiguousarray(wound_outwards(vertices - vertices.mean(axis=0), corners), np.int32)
         head = {"kind": "mesh", "id": number, "vertices": len(vertices), "faces": len(corners)}
         _send(out, head, vertices.tobytes() + corners.tobytes())
-
-
-def _welded(vertices: Array, faces: Any) -> tuple[Any, Any]:
-    """Merge vertices within 1 um and drop faces that collapse: (kept vertex indices, faces)."""
-    keys = np.rint(vertices / _WELD).astype(np.int64)
-    order = np.lexsort(keys.T)
-    new = np.any(np.diff(keys[order], axis=0, prepend=keys[order][:1] - 1) != 0, axis=1)
-    group = np.empty(len(keys), np.int64)
-    group[order] = np.cumsum(new) - 1
-    corners = group[faces]
-    a, b, c = corners.T
-    corners = corners[(a != b) & (b != c) & (c != a)]
-    return order[new], corners
-
-
-def _outward(vertices: Array, faces: Any) -> Any:
-    """Turn the faces of a closed mesh of negative volume round."""
-    a, b, c = vertices[faces].transpose(1, 0, 2)
-    if float(np.einsum("ij,ij->", a, np.cross(b, c))) >= 0.0:
-        return faces
-    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    counts = np.unique(edges, axis=0, return_counts=True)[1]
-    return faces[:, ::-1] if np.all(counts == 2) else faces
 
 
 def _products(model: Any, include: list[str] | None) -> dict[int, Any]:
@@ -225,6 +207,28 @@ def _index(model: Any, products: dict[int, Any]) -> dict[str, Any]:
         "notes": notes,
         "bare": _without_body(model, products),
     }
+
+
+def _unknown(path: str, model: Any) -> list[str]:
+    """A note on entities of types that the schema does not know: the parser passes over them in silence."""
+    import ifcopenshell
+
+    counts: Counter[bytes] = Counter()
+    with Path(path).open("rb") as stream:
+        for line in stream:
+            counts.update(_KEYWORD.findall(line))
+    schema = ifcopenshell.schema_by_name(model.schema_identifier)
+    strange = {}
+    for name, count in counts.items():
+        try:
+            schema.declaration_by_name(name.decode("ascii", "replace"))
+        except RuntimeError:
+            strange[name.decode("ascii", "replace")[:60]] = count
+    if not strange:
+        return []
+    named = ", ".join(sorted(strange)[:5]) + (", ..." if len(strange) > 5 else "")
+    total = sum(strange.values())
+    return [f"{total} entities of types that {model.schema_identifier} does not know were not read: {named}"]
 
 
 def _without_body(model: Any, products: dict[int, Any]) -> int:
