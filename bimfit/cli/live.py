@@ -41,6 +41,9 @@ def run(
         None, "--scan-pose", metavar="POSE|FILE", help="Sensor's pose in the model at the first sweep."
     ),
     flip: bool = typer.Option(False, "--flip", help="The sensor looks into the joint's other mouth."),
+    mirrored: bool = typer.Option(
+        False, "--mirrored", help="The sensor is mounted the other way up: bearings grow from B towards A."
+    ),
     field: str = typer.Option("30deg", "--field", help="Half opening about straight ahead that is measured."),
     sweeps: int | None = typer.Option(None, "--sweeps", metavar="N", min=1, help="End after so many sweeps."),
     sigma: str | None = typer.Option(None, "--sigma", help="The sensor's range noise, such as 3mm."),
@@ -56,6 +59,7 @@ def run(
         length(height, "--height"),
         None if pose is None else read_pose(pose),
         flip,
+        mirrored,
     )
     settings = build_config(config, sigma=sigma)
     half = angle(field, "--field")

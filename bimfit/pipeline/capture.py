@@ -68,7 +68,7 @@ def record(
     speed : float
         Of the sensor along its own z axis, m/s, from the first sweep on.
     pose : ndarray, shape (4, 4), optional
-        T_world_sensor at the first sweep; the sensor's own coordinates by default.
+        T_world_sensor when the first sweep looks ahead; the sensor's own coordinates by default.
     told : callable
         Told the number of sweeps so far.
 
@@ -101,7 +101,7 @@ def record(
 
 
 def _laid_out(kept: list[Sweep], speed: float, pose: Array | None) -> LineScan:
-    first = float(kept[0].times[0])
+    first = float(kept[0].times[np.argmin(np.abs(kept[0].bearings))])
     at = np.eye(4) if pose is None else pose
     scan = line_scan(kept, lambda times: advanced(at, speed * (times - first)), "rangefinder")
     columns = {

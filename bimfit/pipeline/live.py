@@ -206,6 +206,8 @@ class Mount:
         ``start`` and ``height`` do not matter.
     flip : bool
         Look into the joint's other mouth.
+    mirrored : bool
+        Bearings grow from B towards A, as of a sensor that is mounted the other way up.
     """
 
     speed: float | None = None
@@ -213,6 +215,7 @@ class Mount:
     height: float = 0.25
     pose: Array | None = None
     flip: bool = False
+    mirrored: bool = False
 
     def __post_init__(self) -> None:
         if self.speed is not None and not math.isfinite(self.speed):

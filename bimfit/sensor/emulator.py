@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import select
@@ -266,10 +267,19 @@ class Emulator:
         readable, _, _ = select.select(
             [self._master], [self._master] if waiting else [], [], self._pause(now, waiting)
         )
+        self._share()
         if readable:
             data = os.read(self._master, 4096)
             if self._now() >= self._wait:
                 self._device.receive(data, self._now() - self._boot_at)
+
+    def _share(self) -> None:
+        """Let others open the port after a program that had it for itself, as if that closed it for good."""
+        import fcntl
+        import termios
+
+        with contextlib.suppress(OSError):
+            fcntl.ioctl(self._slave, termios.TIOCNXCL)
 
     def _pause(self, now: float, waiting: bool) -> float:
         """How long to sleep at most, in real seconds."""

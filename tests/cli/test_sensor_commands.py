@@ -146,6 +146,23 @@ def test_a_recording_holds_what_the_device_sent(suffix, tmp_path, capsys):
     capsys.readouterr()
 
 
+def test_a_recording_of_a_moving_sensor_in_the_model(tmp_path):
+    """Beams start where the sensor was at their own time: it looks ahead at the given pose, then goes on."""
+    path, pose = tmp_path / "scan.npz", "458657,5438232,3,0,1.5707963267948966,0"
+    with Emulator([WALL], speed=5.0, noise=NO_NOISE) as device:
+        words = ["capture", "--port", device.port, "--sweeps", "4", "--speed", "50mm/s", "--scan-pose", pose]
+        assert main([*words, "-o", str(path)]) == 0
+    scan = read_scan(path)
+    time = scan.extra["time"]
+    ahead = scan.extra["step"] == 384
+    # Turned a quarter about y: the sensor's z axis is the world's x axis, and what lay ahead is below.
+    way = 0.05 * (time - time[ahead][0])
+    np.testing.assert_allclose(scan.origins[:, 0], 458657 + way, atol=2e-8)
+    assert set(scan.origins[:, 1]) == {5438232.0} and set(scan.origins[:, 2]) == {3.0}
+    np.testing.assert_allclose(scan.directions[ahead], [[0.0, 0.0, -1.0]] * 4, atol=1e-12)
+    assert scan.origins[ahead][0, 0] == 458657.0 and np.all(np.diff(scan.origins[ahead][:, 0]) > 0.001)
+
+
 def first_sweeps(device, count=3):
     deadline = time.monotonic() + 20
     while len(device.log) < count:

@@ -2,6 +2,7 @@
 
 import os
 import select
+import sys
 import termios
 import time
 
@@ -232,6 +233,21 @@ def test_clients_one_after_the_other(device):
             port.write(b"VV\n")
             assert port.read(7) == b"VV\n00P\n"
     assert not device.laser
+
+
+def test_a_client_that_had_the_port_for_itself_and_left(device):
+    import fcntl
+
+    with Raw(device.port) as port:
+        fcntl.ioctl(port.fd, termios.TIOCEXCL)
+        port.send(b"QT\n")
+        port.reply()
+    time.sleep(0.1)
+    with Raw(device.port) as port:
+        if sys.platform == "linux":  # root is let in anyway: ask (TIOCGEXCL)
+            assert not fcntl.ioctl(port.fd, 0x80045440, b"\0" * 4)[0]
+        port.send(b"QT\n")
+        assert port.reply() == b"QT\n00P\n\n"
 
 
 def test_an_old_device_is_told_to_speak_scip_2():
