@@ -18,7 +18,8 @@ from bimfit.cli.options import speed as read_speed
 from bimfit.errors import ConfigError
 
 if TYPE_CHECKING:
-    from bimfit.pipeline.live import Live, LiveStation
+    from bimfit.pipeline.live import Live
+    from bimfit.pipeline.live_fit import LiveStation
 
 _HEAD = f"{'sweep':>5} {'s mm':>8} {'width mm':>8} {'+/-':>5} {'u mm':>7} {'v mm':>7} {'deg':>6}  status"
 
@@ -40,6 +41,13 @@ def run(
     pose: str | None = typer.Option(
         None, "--scan-pose", metavar="POSE|FILE", help="Sensor's pose in the model at the first sweep."
     ),
+    trajectory: Path | None = typer.Option(
+        None,
+        "--trajectory",
+        metavar="FILE",
+        help="Instead of a speed: poses in TUM format, by the host's clock or from the first sweep on; "
+        "--scan-pose is then the sensor's on the moving body.",
+    ),
     flip: bool = typer.Option(False, "--flip", help="The sensor looks into the joint's other mouth."),
     mirrored: bool = typer.Option(
         False, "--mirrored", help="The sensor is mounted the other way up: bearings grow from B towards A."
@@ -51,13 +59,16 @@ def run(
     as_json: bool = typer.Option(False, "--json", help="Print a JSON object a sweep."),
 ) -> int:
     """Fit each sweep of a sensor as it comes, a line a sweep, until the joint's end or until interrupted."""
-    from bimfit.pipeline.live import Live, Mount
+    from bimfit.pipeline.carriage import Mount
+    from bimfit.pipeline.live import Live
+    from bimfit.scan.trajectory import read_tum
 
     mount = Mount(
         None if speed is None else read_speed(speed),
         length(start, "--start"),
         length(height, "--height"),
         None if pose is None else read_pose(pose),
+        None if trajectory is None else read_tum(trajectory),
         flip,
         mirrored,
     )

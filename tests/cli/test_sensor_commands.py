@@ -11,8 +11,11 @@ import time
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from bimfit.cli.main import main
+from bimfit.cli.options import read_pose
+from bimfit.pipeline.live import LEFT_OUT
 from bimfit.scan.formats import read_scan
 from bimfit.sensor.emulator import Emulator
 from bimfit.sensor.faults import Fault
@@ -48,7 +51,7 @@ def ended(process, seconds=30):
 
 @pytest.fixture(scope="module")
 def emulated(tmp_path_factory):
-    """A real ``bimfit emulate`` of the packaged sample: its port and its truth.
+    """A real ``bimfit emulate`` of the packaged sample: its port, its truth, and where it starts.
 
     A fault's time counts from the first scan on.
     """
@@ -57,10 +60,11 @@ def emulated(tmp_path_factory):
     process = bimfit("emulate", "--seed", 11, "--truth", folder / "truth.json", *faults)
     port = process.stdout.readline().rstrip("\n")
     (truth,) = read_truth(folder / "truth.json")
-    yield port, truth
+    assert process.stderr.readline().startswith(f"serves joint {truth.id} of {SAMPLE}")
+    start = process.stderr.readline().removeprefix("starts at --scan-pose ").rstrip("\n")
+    yield port, truth, start
     process.send_signal(signal.SIGINT)
-    status, rest, said = ended(process)
-    assert (status, rest) == (0, "") and "starts at --scan-pose" in said
+    assert ended(process) == (0, "", "")
     assert not os.path.lexists(port)
 
 
@@ -75,20 +79,21 @@ def true_gap(truth, s):
 
 
 def test_live_measures_what_is_true_while_things_go_wrong(emulated, samples, capsys):
-    port, truth = emulated
+    port, truth, _ = emulated
     words = ["--port", port, "--speed", "0.05", "--sweeps", "30", "--json"]
     assert main(["live", str(samples / SAMPLE), *words]) == 0
     out, said = capsys.readouterr()
     lines = [json.loads(line) for line in out.splitlines()]
     assert len(lines) == 30 and "30 sweeps measured" in said and "turns missing" in said
+    lines = [line for line in lines if line["reason"] != LEFT_OUT]  # on a machine that has too much to do
     stamps = [line["stamp"] for line in lines]
-    assert min(np.diff(stamps)) == pytest.approx(0.1) and sum(np.diff(stamps) > 0.15) == 2
+    assert min(np.diff(stamps)) == pytest.approx(0.1) and sum(np.diff(stamps) > 0.15) >= 2
     # Sweeps that are lost do not shift those behind them: the stamps say where the sensor was.
     np.testing.assert_allclose(
         [line["s"] for line in lines], 0.05 * (np.array(stamps) - stamps[0]), atol=1e-3
     )
     good = [line for line in lines if line["status"] == "ok"]
-    assert len(good) >= 27
+    assert len(good) >= 0.85 * len(lines) > 8
     errors = np.array([[line["width"], line["u"], line["v"]] - true_gap(truth, line["s"]) for line in good])
     assert np.all(np.abs(errors).mean(axis=0) < [0.0012, 0.0008, 0.0015]), np.abs(errors).mean(axis=0)
     sigmas = np.array([[line["sigma"][name] for name in ("width", "u", "v")] for line in good])
@@ -96,15 +101,25 @@ def test_live_measures_what_is_true_while_things_go_wrong(emulated, samples, cap
 
 
 def test_what_was_captured_replays_alike(emulated, samples, tmp_path, capsys):
-    port, truth = emulated
+    port, truth, start = emulated
     time.sleep(3.2)  # the emulated sensor is back at the joint's start
     scan = tmp_path / "scan.npz"
     assert main(["capture", "--port", port, "--sweeps", "12", "--field", "30deg", "-o", str(scan)]) == 0
     assert capsys.readouterr().out == f"12 sweeps, {12 * 171} beams: {scan}\n"
     words = ["live", str(samples / SAMPLE), "--replay", str(scan)]
     assert main(words) == 2
-    assert "does not say how fast it moves; --speed" in capsys.readouterr().err
-    assert main([*words, "--speed", "50mm/s"]) == 0
+    assert "does not say how it moves; --speed" in capsys.readouterr().err
+    # A trajectory by the host's clock, of a robot that holds the sensor 0.1 m under its own origin.
+    first = next(read_scan(scan).split())
+    begun = first.extra["time"][first.extra["step"] == 384][0]
+    pose, arm = read_pose(start), np.eye(4)
+    arm[0, 3] = 0.1  # ahead of the body's x axis
+    body = pose @ np.linalg.inv(arm)
+    quaternion = Rotation.from_matrix(body[:3, :3]).as_quat()
+    way = tmp_path / "way.tum"
+    rows = [(begun + t, *(body[:3, 3] + 0.05 * t * body[:3, 2]), *quaternion) for t in (-1.0, 0.5, 3.0)]
+    np.savetxt(way, rows, fmt="%.9f", header="time x y z qx qy qz qw")
+    assert main([*words, "--trajectory", str(way), "--scan-pose", "0.1,0,0,0,0,0"]) == 0
     out, said = capsys.readouterr()
     rows = [line.split() for line in out.splitlines()[1:]]
     good = [row for row in rows if row[7] == "ok"]
@@ -228,7 +243,7 @@ def test_nothing_comes_of_nothing(tmp_path, capsys):
         (["emulate", "nothing.csv"], "nothing.csv: cannot be read"),
         (["emulate", "scan.csv", "--truth", "t.json"], "--truth is for models"),
         (["live", "nothing.ifc", "--speed", "0.05"], "nothing.ifc: cannot be read"),
-        (["live", "MODEL"], "does not say how fast it moves"),
+        (["live", "MODEL"], "does not say how it moves"),
         (["live", "MODEL", "--speed", "5mm", "--height", "0"], "--height must be more than 0"),
         (["live", "MODEL", "--replay", "x.csv", "--port", "y"], "exclude one another"),
         (["live", "MODEL", "--replay", "nothing.csv"], "nothing.csv: cannot be read"),
