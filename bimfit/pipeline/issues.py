@@ -198,7 +198,7 @@ def draw_joint(
     path: Path, joint: JointDocument, verdict: Verdict, folder: Path, building: Model | None
 ) -> Path | None:
     """Draw a joint in space, its worst station marked; None where neither elements nor gap are known."""
-    elements, gap = _elements(joint, building), load_gap(joint, folder)
+    elements, gap = joint_elements(joint, building), load_gap(joint, folder)
     if not elements and gap is None:
         return None
     target, outward, along = focus(joint, verdict)
@@ -249,7 +249,8 @@ def _headline(joint: JointDocument, verdict: Verdict) -> str:
     return f"{joint.id}: {worst.name} {worst.value * 1e3:.1f} mm at {worst.station.s * 1e3:.0f} mm"
 
 
-def _elements(joint: JointDocument, building: Model | None) -> list[TriangleMesh]:
+def joint_elements(joint: JointDocument, building: Model | None) -> list[TriangleMesh]:
+    """Meshes of the joint's elements, as designed; none without the model."""
     if building is None:
         return []
     known: Mapping[str, TriangleMesh] = {element.guid: element.mesh for element in building.elements}

@@ -13,7 +13,8 @@ import numpy as np
 
 from bimfit.files import protect_inputs
 from bimfit.pipeline.document import JointDocument, ResultsDocument, StationDocument
-from bimfit.pipeline.issues import limit_series
+from bimfit.pipeline.gap_files import load_gap
+from bimfit.pipeline.issues import joint_elements, limit_series
 from bimfit.pipeline.limits import SURE, Limits, Verdict, judge
 from bimfit.pipeline.output import PICTURES, safe_name
 from bimfit.pipeline.schedule import contact
@@ -32,6 +33,7 @@ from bimfit.report.html import (
 )
 from bimfit.report.limit_plots import plot_limits
 from bimfit.report.style import STATUS
+from bimfit.report.viewer import viewer_model, viewer_script
 
 if TYPE_CHECKING:
     from bimfit.bim.model import Model
@@ -103,7 +105,8 @@ def write_report(
         progress("writing the report", k / len(verdicts))
         plot = _plot(joint, limits) if rank[k] < MOST_PLOTS else ""
         pictures = _pictures(joint, folder) if rank[k] < MOST_PICTURES else ()
-        joints.append(_joint_page(k, joint, verdict, limits, plot, pictures))
+        model = _model(joint, folder, building) if rank[k] < MOST_PICTURES else ""
+        joints.append(_joint_page(k, joint, verdict, limits, plot, pictures, model))
     return write_html(_page(results, verdicts, limits, joints), path)
 
 
@@ -128,6 +131,7 @@ def _page(
         notes=(*results.notes, *notes),
         columns=_COLUMNS,
         joints=joints,
+        script=viewer_script() if any(joint.model for joint in joints) else "",
     )
 
 
@@ -138,6 +142,7 @@ def _joint_page(
     limits: Limits | None,
     plot: str,
     pictures: tuple[Picture, ...],
+    model: str,
 ) -> JointPage:
     lines = [f"Out of limits: {breach.words(limits)}." for breach in verdict.breaches if limits is not None]
     if not lines and verdict.reason:
@@ -157,6 +162,7 @@ def _joint_page(
         stretches=_stretches(joint),
         plot=plot,
         pictures=pictures,
+        model=model,
     )
 
 
@@ -213,8 +219,8 @@ def _figures(joint: JointDocument) -> list[tuple[str, str]]:
         ("gap volume", f"{volume} litre"),
         ("motion along the joint", joint.motion or _NONE),
         ("stations measured", f"{len(joint.trusted)} of {len(joint.stations)}"),
-        ("GlobalId A", joint.elements[0]),
-        ("GlobalId B", joint.elements[1]),
+        ("A", joint.elements[0]),
+        ("B", joint.elements[1]),
     ]
     return [(name, value) for name, value in rows if joint.trusted or _NONE not in value]
 
@@ -251,6 +257,11 @@ def _plot(joint: JointDocument, limits: Limits | None) -> str:
         return ""
     with tempfile.TemporaryDirectory(prefix="bimfit-") as place:
         return embedded(plot_limits(Path(place) / "plot.svg", series).read_bytes(), "image/svg+xml")
+
+
+def _model(joint: JointDocument, folder: Path, building: Model | None) -> str:
+    gap = load_gap(joint, folder)
+    return "" if gap is None else viewer_model(*gap, joint_elements(joint, building))
 
 
 def _pictures(joint: JointDocument, folder: Path) -> tuple[Picture, ...]:

@@ -175,6 +175,25 @@ def test_as_built_model_holds_the_gap(results, model):
     assert before <= {e.GlobalId for e in file.by_type("IfcRoot")}
 
 
+def test_schedule_and_report_are_there(results):
+    assert {"schedule.csv", "schedule.xlsx", "report.html"} <= {path.name for path in results.iterdir()}
+    joint = json.loads((results / "results.json").read_text())["joints"][0]
+    text = (results / "report.html").read_text(encoding="utf-8")
+    assert joint["id"] in text and "No limits were given" in text
+    assert text.count("data:image/jpeg") == 3 and "canvas" in text
+
+
+def test_issues_are_written_and_limits_told(model, scan, tmp_path, capsys):
+    words = ["fit", str(model), str(scan), "--spacing", "0.2", "--motion", "independent", "--no-pictures"]
+    words += ["--no-report", "--no-as-built", "--limits", "width=..1mm", "--bcf", str(tmp_path / "i.bcf")]
+    assert main([*words, "--bcf-version", "3.0", "-o", str(tmp_path / "o")]) == 0
+    told = capsys.readouterr().err
+    assert "0 pass, 1 fail" in told and "1 issue in" in told
+    assert (tmp_path / "i.bcf").stat().st_size > 10_000
+    assert not (tmp_path / "o" / "report.html").exists()
+    assert json.loads((tmp_path / "o" / "results.json").read_text())["limits"] == {"width": [None, 0.001]}
+
+
 def test_pictures_are_drawn(results):
     pictures = sorted(path.name.split("-")[0] for path in results.glob("*.png"))
     assert pictures == ["gap", "scene", "slice", "tables"]
@@ -332,6 +351,9 @@ def test_unknown_names(model, scan, tmp_path, capsys):
     refuse(["fit", model, scan, "--tolerance", "1parsec,1mm,1deg", *out], capsys, "--tolerance")
     refuse(["fit", model, scan, "--spacing", "-1mm", *out], capsys)
     refuse(["fit", model, scan], capsys, "output")
+    refuse(["fit", model, scan, "--limits", "width=3", *out], capsys, "--limits", "12..30mm")
+    refuse(["fit", model, scan, "--bcf", tmp_path / "i.bcf", "--bcf-version", "4", *out], capsys, "3.0")
+    refuse(["fit", model, scan, "--bcf", model, *out], capsys, ".bcf")
     refuse(["nosuchcommand"], capsys, "nosuchcommand")
     refuse(["view", tmp_path], capsys, "results.json")
     settings = tmp_path / "settings.toml"
