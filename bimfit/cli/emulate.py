@@ -17,7 +17,9 @@ from bimfit.errors import ConfigError
 
 if TYPE_CHECKING:
     from bimfit.pipeline.emulate import Emulation
+    from bimfit.sensor.dialogue import Speaker
     from bimfit.sensor.faults import Fault
+    from bimfit.sensor.models import Model
 
 SAMPLE = "square-butt-ifc4.ifc"
 LEFT = {"resting": "", "lit": "BM", "timing": "TM0", "streaming": "MD{:04d}{:04d}01000"}
@@ -43,11 +45,14 @@ def run(
     truth: Path | None = typer.Option(
         None, "--truth", metavar="FILE", help="Where the truth is written (json)."
     ),
-    device: str = typer.Option(
-        "ug01", "--device", metavar="NAME", help="ug01, urg-04lx, ubg-04lx or utm-30lx."
+    device: str | None = typer.Option(
+        None,
+        "--device",
+        metavar="NAME",
+        help="ug01, urg-04lx, ubg-04lx or utm-30lx; default: that of the dialogue, else ug01.",
     ),
-    left: str = typer.Option(
-        "resting", "--left", metavar="STATE", help="How it was left: resting, lit, timing or streaming."
+    left: str | None = typer.Option(
+        None, "--left", metavar="STATE", help="How it was left: resting, lit, timing or streaming."
     ),
     fault: list[str] = typer.Option(
         [], "--fault", metavar="KIND@S[:S]", help="What goes wrong, when and how long, such as unplug@5:2."
@@ -63,8 +68,9 @@ def run(
 
     with stoppable():
         try:
-            options = _device(device, left)
-            served = _served(source, scenario, seed, joint, speed, truth, options["parameters"])
+            kind = _kind(device)
+            _check_left(left)
+            served = _served(source, scenario, seed, joint, speed, truth, kind.parameters)
             with Emulator(
                 served.scene,
                 speed=pace,
@@ -72,7 +78,7 @@ def run(
                 faults=_faults(fault, fault_every, seed),
                 seed=seed,
                 link=link,
-                **options,
+                **_device(kind, served.speaker if device is None else None, left),
             ) as port:
                 _announce(port.port, served)
                 while port.running:
@@ -95,20 +101,31 @@ def _announce(port: str, served: Emulation) -> None:
         print(f"starts at --scan-pose {text}", file=sys.stderr, flush=True)
 
 
-def _device(name: str, left: str) -> dict[str, Any]:
-    """What the emulator is told of the device."""
+def _kind(name: str | None) -> Model:
     from bimfit.sensor.models import MODELS
 
-    if name not in MODELS:
+    if name is not None and name not in MODELS:
         raise ConfigError(f"--device {name}: unknown", remedy=f"choose from {', '.join(MODELS)}")
-    if left not in LEFT:
+    return MODELS[name or "ug01"]
+
+
+def _check_left(left: str | None) -> None:
+    if left is not None and left not in LEFT:
         raise ConfigError(f"--left {left}: unknown", remedy=f"choose from {', '.join(LEFT)}")
-    model = MODELS[name]
-    has = model.parameters
-    request = LEFT[left].format(has.amin, has.amax)
-    waking = "SCIP2.0\n" if model.scip1 and request else ""
-    told = f"{waking}{request}\n".encode("ascii")
-    return {"parameters": has, "identity": model.identity, "scip1": model.scip1, "told": told}
+
+
+def _device(kind: Model, speaker: Speaker | None, left: str | None) -> dict[str, Any]:
+    """What the emulator is told of the device: a recorded one is as it was when it was recorded."""
+    has = (speaker and speaker.parameters) or kind.parameters
+    lit = "lit" if speaker is not None and speaker.lit else "resting"
+    request = LEFT[left or lit].format(has.amin, has.amax)
+    waking = "SCIP2.0\n" if kind.scip1 and request else ""
+    return {
+        "parameters": has,
+        "identity": (speaker and speaker.identity) or kind.identity,
+        "scip1": kind.scip1,
+        "told": f"{waking}{request}\n".encode("ascii"),
+    }
 
 
 def _noise(sigma: str | None) -> Any:

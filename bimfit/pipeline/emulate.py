@@ -17,7 +17,7 @@ from bimfit.pipeline.carriage import advanced, held_over
 from bimfit.pipeline.simulate import designed, longest_open
 from bimfit.pipeline.survey import model_joints
 from bimfit.scan.formats import FORMATS, read_scan
-from bimfit.sensor.dialogue import read_dialogue
+from bimfit.sensor.dialogue import Speaker, read_dialogue, read_speaker
 from bimfit.sensor.scene import MovingScene, Scene
 from bimfit.sensor.scip import IntArray, Parameters
 from bimfit.simulation.motion import random_truth
@@ -43,12 +43,15 @@ class Emulation:
         Where the sensor is at the first scan; None where that is not known.
     truth : JointTruth or None
         What is true of the joint; None of a recording.
+    speaker : Speaker or None
+        The device that the recording is of, where it tells.
     """
 
     scene: Scene
     about: str
     T_world_sensor: Array | None = None
     truth: JointTruth | None = None
+    speaker: Speaker | None = None
 
 
 @dataclass
@@ -187,7 +190,8 @@ def recorded_emulation(path: Path, parameters: Parameters) -> Emulation:
     scene: Scene
     if path.suffix.lower() not in {e for form in FORMATS for e in form.extensions}:
         sweeps = read_dialogue(path)
-        return Emulation(sweeps, f"{len(sweeps)} sweeps of the dialogue {path.name}")
+        about = f"{len(sweeps)} sweeps of the dialogue {path.name}"
+        return Emulation(sweeps, about, speaker=read_speaker(path))
     scan = read_scan(path)
     if not isinstance(scan, LineScan):
         raise ScanError("a point cloud has no sweeps to replay", file=path, remedy="give a line scan")

@@ -92,6 +92,11 @@ class Device:
                 self._line.clear()
                 self._answer(line, now)
 
+    def hush(self) -> None:
+        """Forget the answers that have not left."""
+        self._out.clear()
+        self._pending.clear()
+
     def next_time(self) -> float | None:
         """When the next packet is due; None when nothing is."""
         times = [packet.time for packet in self._out] + [self._ready(turn) for _, _, turn in self._pending]

@@ -4,16 +4,30 @@ from __future__ import annotations
 
 import math
 import struct
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bimfit.errors import ScanError, SensorError
 from bimfit.sensor.clock import SCAN_PHASE, StampUnwrapper
-from bimfit.sensor.replies import Damaged, ReplyParser, ScanReply, fields
+from bimfit.sensor.models import UG01, Identity
+from bimfit.sensor.replies import Damaged, Reply, ReplyParser, ScanReply, fields
 from bimfit.sensor.scip import Parameters
 from bimfit.sensor.sweep import Sweep
 
 _HEADER = struct.Struct(">III")  # seconds, microseconds, number of bytes
 _LONGEST = 1 << 16
+_SAID = {
+    "vendor": "VEND",
+    "product": "PROD",
+    "firmware": "FIRM",
+    "protocol": "PROT",
+    "serial": "SERI",
+    "model": "MODL",
+    "speed": "SCSP",
+    "mode": "MESM",
+    "baud": "SBPS",
+    "status": "STAT",
+}
 
 
 def read_log(path: str | Path) -> list[tuple[float, bytes]]:
@@ -47,6 +61,58 @@ def read_log(path: str | Path) -> list[tuple[float, bytes]]:
         records.append((seconds + micros * 1e-6, data[at : at + length]))
         at += length
     return records
+
+
+@dataclass(frozen=True)
+class Speaker:
+    """The device that a dialogue was recorded from, as far as it says.
+
+    Attributes
+    ----------
+    identity : Identity or None
+        None where it does not say who it is.
+    parameters : Parameters or None
+        None where it does not tell its geometry.
+    lit : bool
+        Whether its laser was on from the beginning.
+    """
+
+    identity: Identity | None = None
+    parameters: Parameters | None = None
+    lit: bool = False
+
+
+def read_speaker(path: str | Path) -> Speaker:
+    """Read who speaks in a recorded dialogue (:func:`read_log`); nothing of it has to be there.
+
+    Raises
+    ------
+    ScanError
+        When the file cannot be read.
+    """
+    said: dict[str, str] = {}
+    lit: bool | None = None
+    parser = ReplyParser()
+    for event in (event for _, data in read_log(path) for event in parser.feed(data)):
+        if isinstance(event, ScanReply):
+            # GD is only answered while the laser is on; MD switches it on.
+            lit = (not event.request.streams) if lit is None else lit
+        elif isinstance(event, Reply) and event.status == "00" and event.name in ("VV", "PP", "II"):
+            try:
+                found = fields(event)
+            except SensorError:
+                continue
+            lit = found["LASR"] == "ON" if lit is None and "LASR" in found else lit
+            said = {**found, **said}
+        elif isinstance(event, Reply) and lit is None and event.name == "BM":
+            lit = event.status == "02"
+    try:
+        parameters = Parameters.from_fields(said)
+    except SensorError:
+        parameters = None
+    known = {name: said[key] for name, key in _SAID.items() if key in said}
+    identity = replace(UG01, **known) if "PROD" in said else None
+    return Speaker(identity, parameters, bool(lit))
 
 
 def read_dialogue(path: str | Path, parameters: Parameters | None = None) -> tuple[Sweep, ...]:

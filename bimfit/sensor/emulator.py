@@ -176,6 +176,7 @@ class Emulator:
         self._zero = time.monotonic()
         self._device = self._switched_on(**self._first)
         self._device.receive(self._told, 0.0)
+        self._device.hush()  # the answers went to whoever asked
         self._plug()
         self.port = str(self._link)
         self._stop.clear()

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import select
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -176,6 +178,45 @@ def test_a_recording_of_a_moving_sensor_in_the_model(tmp_path):
     assert set(scan.origins[:, 1]) == {5438232.0} and set(scan.origins[:, 2]) == {3.0}
     np.testing.assert_allclose(scan.directions[ahead], [[0.0, 0.0, -1.0]] * 4, atol=1e-12)
     assert scan.origins[ahead][0, 0] == 458657.0 and np.all(np.diff(scan.origins[ahead][:, 0]) > 0.001)
+
+
+def test_the_recorded_dialogue_over_a_real_port(shared):
+    """Sent what the recorded client wrote, when it did, the device says what it said, but for its clock."""
+    written, read = (recorded(shared / "scip" / f"example_urg_04lx.log{letter}") for letter in "wr")
+    served = bimfit("emulate", shared / "scip" / "example_urg_04lx.logr")
+    try:
+        port = os.open(served.stdout.readline().rstrip("\n"), os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        begin, heard = time.monotonic(), b""
+        for at, data in [*written, (written[-1][0] + 2.0, b"")]:
+            while (left := begin + at - written[0][0] - time.monotonic()) > 0:
+                if select.select([port], [], [], left)[0]:
+                    heard += os.read(port, 4096)
+                if b"\nGD" in heard and heard.endswith(b"\n\n"):
+                    break
+            os.write(port, data)
+        os.close(port)
+    finally:
+        served.send_signal(signal.SIGINT)
+        assert ended(served)[0] == 0
+
+    def told(data):
+        lines = data.split(b"\n")
+        clock = [
+            k for k, line in enumerate(lines) if line.startswith(b"TIME:") or lines[k - 2].startswith(b"GD")
+        ]
+        return [b"clock" if k in clock else line for k, line in enumerate(lines)], len(clock)
+
+    assert told(heard) == told(b"".join(data for _, data in read))
+    assert told(heard)[1] == 3
+
+
+def recorded(path):
+    data, records, at = path.read_bytes(), [], 0
+    while at < len(data):
+        seconds, micros, length = struct.unpack(">III", data[at : at + 12])
+        records.append((seconds + micros * 1e-6, data[at + 12 : at + 12 + length]))
+        at += 12 + length
+    return records
 
 
 def first_sweeps(device, count=3):

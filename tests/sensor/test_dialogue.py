@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from bimfit.errors import ScanError
-from bimfit.sensor.dialogue import read_dialogue, read_log
+from bimfit.sensor.dialogue import Speaker, read_dialogue, read_log, read_speaker
+from bimfit.sensor.models import URG_04LX
+from bimfit.sensor.scip import Parameters
 
 
 def log(pieces):
@@ -48,3 +50,17 @@ def test_what_is_no_dialogue(tmp_path):
             read_dialogue(path)
     with pytest.raises(ScanError, match="cannot be read"):
         read_dialogue(tmp_path / "none")
+
+
+def test_who_speaks_in_a_dialogue(dialogue, ug01_reply, tmp_path):
+    path = tmp_path / "log"
+    path.write_bytes(log(dialogue[1]))
+    assert read_speaker(path) == Speaker(
+        URG_04LX, Parameters("URG-04LX(Hokuyo Automatic Co.,Ltd.)"), lit=True
+    )
+    path.write_bytes(ug01_reply)  # GD is answered only by a device whose laser is on
+    assert read_speaker(path) == Speaker(lit=True)
+    path.write_bytes(b"BM\n00P\n\nPP\n00P\nDMIN:20;5\n\nVV\n00P\n\n" + ug01_reply)
+    assert read_speaker(path) == Speaker()
+    path.write_bytes(b"\xff" * 100)
+    assert read_speaker(path) == Speaker()
