@@ -187,17 +187,24 @@ def recorded_emulation(path: Path, parameters: Parameters) -> Emulation:
     ScanError
         When the file cannot be read, or is a point cloud.
     """
-    scene: Scene
-    if path.suffix.lower() not in {e for form in FORMATS for e in form.extensions}:
-        sweeps = read_dialogue(path)
-        about = f"{len(sweeps)} sweeps of the dialogue {path.name}"
-        return Emulation(sweeps, about, speaker=read_speaker(path))
-    scan = read_scan(path)
+    known = {extension for form in FORMATS for extension in form.extensions}
+    if not known & {suffix.lower() for suffix in path.suffixes[-2:]}:
+        try:
+            sweeps = read_dialogue(path)
+            about = f"{len(sweeps)} sweeps of the dialogue {path.name}"
+            return Emulation(sweeps, about, speaker=read_speaker(path))
+        except ScanError as no_dialogue:
+            try:
+                scan = read_scan(path)  # a scan is known by what is in it, too
+            except ScanError:
+                raise no_dialogue from None
+    else:
+        scan = read_scan(path)
     if not isinstance(scan, LineScan):
         raise ScanError("a point cloud has no sweeps to replay", file=path, remedy="give a line scan")
     if not len(scan):
         raise ScanError("there is no sweep to replay", file=path)
-    scene = _raw_rows(scan, parameters) or scan
+    scene: Scene = _raw_rows(scan, parameters) or scan
     return Emulation(scene, f"{len(scan.sweeps)} sweeps of {path.name}")
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from bimfit.errors import SensorError
 from bimfit.geometry.line_scan import LineScan
 from bimfit.sensor.noise import Noise
-from bimfit.sensor.scip import FloatArray, IntArray, Parameters
+from bimfit.sensor.scip import FIRST_MEASUREMENT, FloatArray, IntArray, Parameters
 from bimfit.sensor.sweep import Sweep
 
 StillScene = Callable[[FloatArray], FloatArray]
@@ -38,8 +38,9 @@ def measurer(
     """Turn a scene into what :class:`~bimfit.sensor.device.Device` asks of it.
 
     A callable is measured with noise. Recordings are sent as they are, one sweep a rotation, over and over:
-    line scans, sweeps, or arrays of raw values for steps amin to amax. A line scan does not tell where the
-    sensor's front was; the middle beam of each sweep is taken to look ahead.
+    line scans, sweeps, or arrays of raw values for steps amin to amax. A line scan in its sensor's own
+    coordinates has x ahead; any other does not tell where the sensor's front was, and the middle beam of each
+    sweep is taken to look ahead.
 
     Raises
     ------
@@ -67,18 +68,29 @@ def measurer(
 
 def _from_line_scan(scan: LineScan, parameters: Parameters) -> list[IntArray]:
     rows = []
+    own = not scan.origins.any() and not scan.directions[:, 2].any()
     for sweep in scan.split():
         directions = sweep.directions
+        if len(directions) > 1 and np.all(directions == directions[0]):
+            raise SensorError(
+                "beams that are parallel are no rangefinder's sweep",
+                file=scan.source or None,
+                place=f"sweep {sweep.scan[0]}",
+            )
         mm = np.rint(np.nan_to_num(sweep.ranges, nan=0.0) * 1000.0).astype(np.int64)
         # Our own recordings know the codes of what is missing.
         missing = _column(sweep, "code").astype(np.int64) if "code" in sweep.extra else 0
-        steps = np.rint(_bearings(directions) / (2.0 * np.pi) * parameters.ares).astype(np.int64)
+        bearings = np.arctan2(directions[:, 1], directions[:, 0]) if own else _bearings(directions)
+        steps = np.rint(bearings / (2.0 * np.pi) * parameters.ares).astype(np.int64)
         steps += parameters.afrt
         values = np.where((mm >= parameters.dmin) & (mm <= parameters.dmax), mm, missing)
         row = np.zeros(parameters.amax - parameters.amin + 1, dtype=np.int64)
         inside = (steps >= parameters.amin) & (steps <= parameters.amax)
         row[steps[inside] - parameters.amin] = values[inside]
         rows.append(row)
+    if not any((row >= FIRST_MEASUREMENT).any() for row in rows):
+        near, far = parameters.dmin / 1000.0, parameters.dmax / 1000.0
+        raise SensorError(f"nothing lies {near:g} to {far:g} m from the sensor", file=scan.source or None)
     return rows
 
 

@@ -127,6 +127,24 @@ def test_scenes_that_do_not_fit():
             measurer(scene, HAS, Noise(), np.random.default_rng(0))
 
 
+def test_a_line_scan_in_its_own_coordinates_knows_ahead():
+    row = np.random.default_rng(5).integers(20, 5600, 682)  # no beam in the middle
+    scan = replace(line_scan([sweep_of(row)]), extra={})
+    assert measurer(scan, HAS, Noise(), None)(0.0).tolist() == row.tolist()
+
+
+def test_a_scan_out_of_reach_is_told():
+    scan = line_scan([sweep_of(np.full(682, 3000))])
+    with pytest.raises(SensorError, match="nothing lies 0.02 to 5.6 m"):
+        measurer(replace(scan, ranges=np.full(682, 22.0), extra={}), HAS, Noise(), None)
+
+
+def test_parallel_beams_are_no_sweep():
+    scan = line_scan([sweep_of(np.full(682, 1000))])
+    with pytest.raises(SensorError, match="sweep 0: beams that are parallel"):
+        measurer(replace(scan, directions=np.tile([0.0, 0.0, -1.0], (682, 1))), HAS, Noise(), None)
+
+
 def test_line_scan_places_beams():
     sweeps = [sweep_of(np.full(171, 1000), k, ScanRequest("MD", 299, 469), 10.0 + k) for k in range(3)]
     own = line_scan(sweeps)
