@@ -135,7 +135,7 @@ def test_a_line_scan_in_its_own_coordinates_knows_ahead():
 
 def test_a_scan_out_of_reach_is_told():
     scan = line_scan([sweep_of(np.full(682, 3000))])
-    with pytest.raises(SensorError, match="nothing lies 0.02 to 5.6 m"):
+    with pytest.raises(SensorError, match=r"nothing lies 0\.02 to 5\.6 m"):
         measurer(replace(scan, ranges=np.full(682, 22.0), extra={}), HAS, Noise(), None)
 
 
