@@ -33,6 +33,7 @@ _RANK = {state: rank for rank, state in enumerate(_STATES)}
 _HIDDEN = ("sheet", "patch")
 _DIGITS = "23456789abcdefghjkmnpqrstvwxyz"
 _ID_LENGTH, _MOST_DIGITS = 5, 12
+_USUAL = JointConfig()
 _LOOSE = (0.06, 0.12, 0.25, 0.5)
 
 
@@ -260,9 +261,18 @@ def _related(a: Element, b: Element) -> bool:
 
 
 def _place(draft: Draft) -> tuple[float, ...]:
-    """What orders the joints of one pair: state, length, then the place to a millimetre."""
+    """What orders the joints of one pair: state, length, then the place to a millimetre.
+
+    Those that only other limits than the usual ones find come last: so the others keep their numbers.
+    """
     middle = np.round(draft.path.points.mean(axis=0), 3)
-    return (float(_RANK[draft.state]), -round(draft.leg.length, 3), *(float(x) for x in middle))
+    unusual = draft.leg.gap > _USUAL.max_gap or draft.leg.length < _USUAL.min_length
+    return (
+        float(unusual),
+        float(_RANK[draft.state]),
+        -round(draft.leg.length, 3),
+        *(float(x) for x in middle),
+    )
 
 
 def _ids(names: Sequence[str]) -> list[str]:

@@ -71,7 +71,8 @@ def choose_joints(
     """The joints that a user means.
 
     The finder runs with its own limits, widened where a wider gap or a shorter joint is asked for, and what
-    it finds is narrowed afterwards: a joint keeps its id however it was chosen.
+    it finds is narrowed afterwards: a joint keeps its id however it was chosen, unless a wider gap makes it
+    part of a larger joint.
 
     Parameters
     ----------
@@ -174,7 +175,10 @@ def _fits(joint: Joint, choice: Selection) -> bool:
 
 
 def _why_nothing(found: Sequence[Joint], choice: Selection) -> str:
-    widths, lengths = [1e3 * joint.width for joint in found], [joint.length for joint in found]
+    widths, lengths = (
+        [round(1e3 * joint.width, 1) + 0.0 for joint in found],
+        [joint.length for joint in found],
+    )
     asked = {
         "--class": choice.classes,
         "--storey": choice.storeys,

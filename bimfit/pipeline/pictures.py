@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bimfit.config import Config
-from bimfit.errors import BimfitError, ConfigError
+from bimfit.errors import ConfigError
 from bimfit.geometry.mesh import TriangleMesh
 from bimfit.geometry.pose import Array
+from bimfit.pipeline.document import read_results
 from bimfit.pipeline.fit import DESIGNED
+from bimfit.pipeline.gap_files import load_gap
+from bimfit.pipeline.issues import joint_elements, open_building
 from bimfit.pipeline.output import safe_name
 from bimfit.pipeline.records import JointResult, StationResult, SurveyResult
 from bimfit.pipeline.targets import expected_viewpoint, make_targets, matched_edges, matched_slice
@@ -218,42 +220,20 @@ def folder_scene(folder: Path) -> JointScene:
     ConfigError
         When the folder holds no results of bimfit.
     """
-    file = folder / "results.json"
-    try:
-        results = json.loads(file.read_text(encoding="utf-8"))
-        names = [joint["meshes"]["ply"] for joint in results["joints"] if joint.get("mesh")]
-    except OSError as error:
-        raise ConfigError(
-            "holds no results.json", file=folder, remedy="name a folder of bimfit fit"
-        ) from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise ConfigError("is not a results file of bimfit", file=file) from error
-    if not names:
-        raise ConfigError("holds no gap mesh: no joint could be estimated", file=file)
-    import trimesh
-
-    meshes = [trimesh.load_mesh(folder / name, process=False) for name in names]
-    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    gap = TriangleMesh.of(
-        np.concatenate([mesh.vertices for mesh in meshes]),
-        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]),
+    results = read_results(folder)
+    gaps = [gap for gap in (load_gap(joint, folder) for joint in results.joints) if gap is not None]
+    if not gaps:
+        raise ConfigError("holds no gap mesh: no joint could be estimated", file=folder)
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh, _ in gaps)])
+    whole = TriangleMesh.of(
+        np.concatenate([mesh.vertices for mesh, _ in gaps]),
+        np.concatenate([mesh.faces + start for (mesh, _), start in zip(gaps, starts, strict=False)]),
     )
-    widths = [mesh.metadata["_ply_raw"]["vertex"]["data"]["width"].ravel() for mesh in meshes]
-    return JointScene(
-        elements=_model_elements(results), gap=gap, gap_width=np.concatenate(widths), title=str(folder)
-    )
-
-
-def _model_elements(results: dict[str, Any]) -> list[TriangleMesh]:
-    """The joints' elements; none where the model has been moved away since."""
-    guids = sorted({guid for joint in results["joints"] for guid in joint["elements"]})
-    try:
-        from bimfit.bim.model import load_model
-
-        model = load_model(Path(results["model"]))
-        return [model.element(guid).mesh for guid in guids]
-    except BimfitError:
-        return []
+    building = open_building(results)
+    drawn = [mesh for joint in results.joints for mesh in joint_elements(joint, building)]
+    elements = list({id(mesh): mesh for mesh in drawn}.values())
+    widths = np.concatenate([width for _, width in gaps])
+    return JointScene(elements=elements, gap=whole, gap_width=widths, title=str(folder))
 
 
 def _half_distances(s: Array) -> Array:
