@@ -1104,16 +1104,25 @@ def _narrowed(
 
 @jit
 def _rival(values: Array, points: Array, count: int, total: float, h: float, info: Array) -> None:
-    """Mass more than 3 mm from the mode along the weak axis, and where most of it lies."""
+    """Mass more than 3 mm from the mode along the weak axis and beyond a valley, and where most of it lies.
+
+    What hangs together with the mode, as the whole cell between two beams that an edge may lie in, is
+    width and no rival: the covariance tells it.
+    """
     cells = int((points[count - 1, 3] - points[0, 3]) / h + 0.5) + 1
     lo = points[0, 3] - 0.5 * h
     mass = np.zeros(cells)
     for k in range(count):
         mass[min(int((points[k, 3] - lo) / h), cells - 1)] += values[k] / total
     top = int(np.argmax(mass))
+    left, right = top, top
+    while left > 0 and mass[left - 1] > 0.1 * mass[top]:
+        left -= 1
+    while right < cells - 1 and mass[right + 1] > 0.1 * mass[top]:
+        right += 1
     rival, centre = 0.0, 0.0
     for c in range(cells):
-        if abs(c - top) * h > 0.003:
+        if (c < left or c > right) and abs(c - top) * h > 0.003:
             rival += mass[c]
             centre += mass[c] * (c - top) * h
     info[6] = rival
