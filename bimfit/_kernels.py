@@ -21,8 +21,13 @@ def jit_fast(function: Callable[..., Any]) -> Callable[..., Any]:
     return _compiled(function, fastmath=True)
 
 
-def _compiled(function: Callable[..., Any], *, fastmath: bool) -> Callable[..., Any]:
-    options = {"nogil": True, "error_model": "numpy", "fastmath": fastmath}
+def jit_sums(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same where sums may be taken in another order, which makes vector code; inf and NaN are safe."""
+    return _compiled(function, fastmath={"reassoc", "contract"})
+
+
+def _compiled(function: Callable[..., Any], *, fastmath: bool | set[str]) -> Callable[..., Any]:
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": fastmath}
     try:
         compiled: Callable[..., Any] = nb.njit(cache=True, **options)(function)
     except RuntimeError:  # numba found no directory for its cache: a read-only installation

@@ -6,9 +6,11 @@ Beams come sorted by pseudo-angle within groups of one origin each, as arrays:
 ``d``      (2, n) unit directions;  ``r`` (n,) ranges, negative where nothing came back
 ``start``  (g + 1,) first beam of every group;  ``eye`` (g, 4) origin and look direction of every group
 
-``off`` (n,) is added to the log-likelihood whenever the beam is predicted to meet the component, ``deep``
-(n,) besides when its return lies more than ``margin`` behind the component, and ``lim`` (n,) is the range
-at which something else is in the way. No ``fastmath``: misses rely on inf.
+The likelihood takes them as one array ``B`` (9, n), whose rows are p, the two of d, and then r; OFF, which is
+added to the log-likelihood whenever the beam is predicted to meet the component; DEEP, besides when its
+return lies more than ``margin`` behind the component; LIMIT, the range at which something else is in the
+way; INVERSE, 1 / sigma of its range; TOP, log A, the log-odds of a return on the spot against an outlier
+there. No arithmetic that assumes that inf does not exist: misses rely on it.
 """
 
 from __future__ import annotations
@@ -19,11 +21,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bimfit._kernels import jit
+from bimfit._kernels import jit, jit_sums
 from bimfit.geometry.pose import Array
 
 Ints = NDArray[np.int64]
 
+RANGE, OFF, DEEP, LIMIT, INVERSE, TOP = 3, 4, 5, 6, 7, 8
 STEEP = 0.3
 NEVER = 1 << 40
 
@@ -41,11 +44,11 @@ def pseudo_angle(x: float, y: float) -> float:
 
 
 @jit
-def _lower(p: Array, lo: int, hi: int, value: float) -> int:
-    """First index in [lo, hi) whose p is at least value."""
+def _lower(rays: Array, lo: int, hi: int, value: float) -> int:
+    """First index in [lo, hi) whose pseudo-angle, the first row of ``rays``, is at least value."""
     while lo < hi:
         mid = (lo + hi) >> 1
-        if p[mid] < value:
+        if rays[0, mid] < value:
             lo = mid + 1
         else:
             hi = mid
@@ -54,17 +57,16 @@ def _lower(p: Array, lo: int, hi: int, value: float) -> int:
 
 @jit
 def _nearer(
-    nx: float, ny: float, c: float, e: int, dx: Array, dy: Array, begin: int, end: int, rho: Array, face: Ints
+    nx: float, ny: float, c: float, e: int, rays: Array, begin: int, end: int, rho: Array, face: Ints
 ) -> None:
     """Lower rho over a stretch of beams; no branches, so that it becomes vector code."""
-    # slices from 0: a signed index that could be negative would keep LLVM from vectorising
-    x0, y0, rho0, face0 = dx[begin:end], dy[begin:end], rho[begin:end], face[begin:end]
-    for k in range(x0.shape[0]):
-        x = c / (nx * x0[k] + ny * y0[k])
-        old = rho0[k]
+    # unsigned: an index that could be negative would keep LLVM from vectorising
+    for k in range(np.uint64(begin), np.uint64(end)):
+        x = c / (nx * rays[1, k] + ny * rays[2, k])
+        old = rho[k]
         nearer = (x < old) & (x > 0.0)
-        rho0[k] = x if nearer else old
-        face0[k] = e if nearer else face0[k]
+        rho[k] = x if nearer else old
+        face[k] = e if nearer else face[k]
 
 
 @jit
@@ -74,8 +76,7 @@ def predict(
     sin: float,
     tx: float,
     ty: float,
-    p: Array,
-    d: Array,
+    rays: Array,
     start: Ints,
     eye: Array,
     rho: Array,
@@ -87,10 +88,11 @@ def predict(
     ----------
     edges : (m, 6)
         Ends a, b and outward unit normal; moved by the rotation (cos, sin) about 0, then by (tx, ty).
+    rays : (3 or more, n)
+        Pseudo-angle and direction of every beam.
     rho, face : (n,)
         In and out: ranges and edge indices so far.
     """
-    dx, dy = d[0], d[1]
     for e in range(edges.shape[0]):
         nx = cos * edges[e, 4] - sin * edges[e, 5]
         ny = sin * edges[e, 4] + cos * edges[e, 5]
@@ -108,12 +110,12 @@ def predict(
             low = pseudo_angle(lx * dbx + ly * dby, lx * dby - ly * dbx)
             s, t = start[g], start[g + 1]
             if low <= high:
-                i0, i1, j1 = _lower(p, s, t, low), _lower(p, s, t, high), s
+                i0, i1, j1 = _lower(rays, s, t, low), _lower(rays, s, t, high), s
             else:  # the edge lies across the cut behind the sensor
-                i0, i1, j1 = _lower(p, s, t, low), t, _lower(p, s, t, high)
-            _nearer(nx, ny, c, e, dx, dy, i0, i1, rho, face)
+                i0, i1, j1 = _lower(rays, s, t, low), t, _lower(rays, s, t, high)
+            _nearer(nx, ny, c, e, rays, i0, i1, rho, face)
             if j1 > s:
-                _nearer(nx, ny, c, e, dx, dy, s, j1, rho, face)
+                _nearer(nx, ny, c, e, rays, s, j1, rho, face)
 
 
 @jit
@@ -198,20 +200,16 @@ def cover_cost(r: Array, miss: float, past: float, same: float, off: Array, deep
 
 @jit
 def scene(
-    edges_a: Array, edges_b: Array, pose_a: Array, pose_b: Array, p: Array, d: Array, start: Ints, eye: Array,
+    edges_a: Array, edges_b: Array, pose_a: Array, pose_b: Array, rays: Array, start: Ints, eye: Array,
     rho: Array, face: Ints,
 ) -> None:  # fmt: skip
     """Ranges (2, n) to A and to B at a pose each, and the edges met."""
     rho[:] = np.inf
     face[:] = -1
-    predict(
-        edges_a, math.cos(pose_a[2]), math.sin(pose_a[2]), pose_a[0], pose_a[1], p, d, start, eye, rho[0],
-        face[0],
-    )  # fmt: skip
-    predict(
-        edges_b, math.cos(pose_b[2]), math.sin(pose_b[2]), pose_b[0], pose_b[1], p, d, start, eye, rho[1],
-        face[1],
-    )  # fmt: skip
+    cos, sin = math.cos(pose_a[2]), math.sin(pose_a[2])
+    predict(edges_a, cos, sin, pose_a[0], pose_a[1], rays, start, eye, rho[0], face[0])
+    cos, sin = math.cos(pose_b[2]), math.sin(pose_b[2])
+    predict(edges_b, cos, sin, pose_b[0], pose_b[1], rays, start, eye, rho[1], face[1])
 
 
 @jit
@@ -276,7 +274,7 @@ def _better_cut(
 
 @jit
 def through(
-    corners: Array, p: Array, r: Array, start: Ints, eye: Array, nearest: Array, depth: float, sigma: float
+    corners: Array, rays: Array, r: Array, start: Ints, eye: Array, nearest: Array, depth: float, sigma: float
 ) -> int:
     """How many beams went in between the mouth corners (2, 2); see ownership.through."""
     passed = between = 0
@@ -290,102 +288,132 @@ def through(
             x, y = corners[c, 0] - ox, corners[c, 1] - oy
             bearing = pseudo_angle(lx * x + ly * y, lx * y - ly * x)
             low, high, level = min(low, bearing), max(high, bearing), max(level, math.hypot(x, y))
-        step = 0.5 * float(np.median(p[s + 1 : t] - p[s : t - 1]))
-        for k in range(_lower(p, s, t, low - step), _lower(p, s, t, high + step)):
+        step = 0.5 * float(np.median(rays[0, s + 1 : t] - rays[0, s : t - 1]))
+        for k in range(_lower(rays, s, t, low - step), _lower(rays, s, t, high + step)):
             own = abs(r[k] - nearest[k]) < 4.0 * sigma and r[k] > level + 2.0 * sigma
             passed += int(r[k] < 0.0 or r[k] > level + depth or own)
             between += 1
     return passed if 2 * passed >= between else 0
 
 
-@jit
-def log_table(amplitude: float, scale: float, table: Array) -> None:
-    """Fill row 0 with log(1 + a) and row 1 with a / (1 + a), a = A exp(-q / 2), q = index * scale."""
-    for i in range(table.shape[1]):
-        a = amplitude * math.exp(-0.5 * i * scale)
-        table[0, i] = math.log(1.0 + a)
-        table[1, i] = a / (1.0 + a)
-    table[:, table.shape[1] - 2 :] = 0.0
+@jit_sums
+def _hit(t: float) -> tuple[float, float]:
+    """log(1 + exp(t)) and its derivative without branches or tables, to 1e-5."""
+    x = min(abs(t), 32.0)
+    y = 0.0625 * x
+    h, q = 0.5 * y, y * y / 12.0
+    e = (1.0 - h + q) / (1.0 + h + q)  # exp(-y), then its 16th power
+    e *= e
+    e *= e
+    e *= e
+    e *= e
+    # Abramowitz and Stegun 4.1.43
+    log = e * (0.99949556 + e * (-0.49190896 + e * (0.28947478 + e * (-0.13606275 + e * 0.03215845))))
+    up = t > 0.0
+    return (t if up else 0.0) + log, (1.0 if up else e) / (1.0 + e)
+
+
+@jit_sums
+def _total(B: Array, margin: float, rho: Array, face: Ints) -> float:
+    """Sum over covered beams of the residual's term and the cost of covering."""
+    total = 0.0
+    for k in range(B.shape[1]):
+        z = B[RANGE, k] - rho[k]
+        q = z * B[INVERSE, k]
+        value = _hit(B[TOP, k] - 0.5 * q * q)[0] + B[OFF, k] + (B[DEEP, k] if z > margin else 0.0)
+        total += value if face[k] >= 0 else 0.0
+    return total
 
 
 @jit
 def log_likelihood(
     edges: Array,
     pose: Array,
-    p: Array,
-    d: Array,
-    r: Array,
+    B: Array,
     start: Ints,
     eye: Array,
-    off: Array,
-    deep: Array,
     margin: float,
-    lim: Array,
-    sigma: float,
-    spread: float,
-    table: Array,
-    scale: float,
+    bearing: float,
     rho: Array,
     face: Ints,
 ) -> float:
     """Log-likelihood at a pose (tx, ty, theta), as a difference from 'every beam misses'.
 
-    Where a face is nearly edge-on (|n.d| < STEEP) a range depends on the bearing more than on anything:
-    sigma^2 grows by the factor 1 + spread (rho tan i)^2 there, spread = (bearing's sd / sigma)^2.
+    A return at r adds log(1 + A exp(-d^2 / 2)), d = (r - rho) / sigma (METHOD, section 4, step 4). Where a
+    face is nearly edge-on (|n.d| < STEEP) a range depends on the bearing more than on anything: sigma^2
+    grows there by (bearing's sd * rho tan i)^2.
     """
-    n = p.shape[0]
-    for k in range(n):
-        rho[k] = lim[k]
+    for k in range(B.shape[1]):
+        rho[k] = B[LIMIT, k]
         face[k] = -1
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    predict(edges, cos, sin, pose[0], pose[1], p, d, start, eye, rho, face)
-    total: float = _total(edges, cos, sin, d, r, off, deep, margin, sigma, spread, table, scale, rho, face)
+    predict(edges, cos, sin, pose[0], pose[1], B, start, eye, rho, face)
+    total: float = _total(B, margin, rho, face)
+    if bearing > 0.0:
+        total += _steep(edges, cos, sin, B, bearing, rho, face)
     return total
 
 
 @jit
-def _total(
-    edges: Array,
-    cos: float,
-    sin: float,
-    d: Array,
-    r: Array,
-    off: Array,
-    deep: Array,
-    margin: float,
-    sigma: float,
-    spread: float,
-    table: Array,
-    scale: float,
-    rho: Array,
-    face: Ints,
-) -> float:
-    """Sum over covered beams of the residual's term and the cost of covering."""
-    unit = 1.0 / (sigma * sigma * scale)
-    last = table.shape[1] - 1.5
-    logs = table[0]
-    total = 0.0
+def _steep(edges: Array, cos: float, sin: float, B: Array, bearing: float, rho: Array, face: Ints) -> float:
+    """What faces met nearly edge-on add to the sum that took them for others."""
     edge, steep, c2 = -1, False, 1.0
-    for k in range(r.shape[0]):
+    total = 0.0
+    for k in range(face.shape[0]):
         e = face[k]
         if e < 0:
             continue
         if e != edge:
             edge = e
-            nx = cos * edges[e, 4] - sin * edges[e, 5]
-            ny = sin * edges[e, 4] + cos * edges[e, 5]
-            nd = nx * d[0, k] + ny * d[1, k]
+            nd = _lean(edges, e, cos, sin, B[1, k], B[2, k])
             steep = nd > -STEEP
             c2 = (rho[k] * nd) ** 2
-        z = r[k] - rho[k]
-        x = z * z * unit
         if steep:
-            s2 = 1.0 + spread * rho[k] * rho[k] * (rho[k] * rho[k] / c2 - 1.0)
-            x = x / s2 + math.log(s2) / scale
-        total += logs[int(min(x, last) + 0.5)] + off[k]
-        if z > margin:
-            total += deep[k]
+            q = (B[RANGE, k] - rho[k]) * B[INVERSE, k]
+            grow = 1.0 + (bearing * B[INVERSE, k] * rho[k]) ** 2 * (rho[k] * rho[k] / c2 - 1.0)
+            total -= _hit(B[TOP, k] - 0.5 * q * q)[0]
+            total += _hit(B[TOP, k] - 0.5 * (q * q / grow + math.log(grow)))[0]
     return total
+
+
+@jit
+def _lean(edges: Array, e: int, cos: float, sin: float, dx: float, dy: float) -> float:
+    """n.d of a turned edge and a beam."""
+    nx = cos * edges[e, 4] - sin * edges[e, 5]
+    ny = sin * edges[e, 4] + cos * edges[e, 5]
+    lean: float = nx * dx + ny * dy
+    return lean
+
+
+@jit_sums
+def _stretch(
+    B: Array, first: int, end: int, nx: float, ny: float, c: float, lever: float, slope: float, soft: float,
+    drop: float, bearing: float, rho: Array,
+) -> tuple[float, float, float, float, float]:  # fmt: skip
+    """Sums of w f^2, w f^2 arm, w f^2 arm^2, w f z and w f z arm over a stretch of beams on one face."""
+    s0 = s1 = s2 = t0 = t1 = 0.0
+    over = 1.0 / c
+    for k in range(np.uint64(first), np.uint64(end)):
+        near = rho[k]
+        i = B[INVERSE, k] * soft
+        z = (B[RANGE, k] - near) * i
+        top = B[TOP, k] - drop
+        if bearing > 0.0:  # the same for the whole stretch
+            lean = near * over
+            grow = 1.0 + (bearing * B[INVERSE, k] * near) ** 2 * (lean * lean - 1.0)
+            w = _hit(top - 0.5 * (z * z / grow + math.log(grow)))[1] / grow
+        else:
+            w = _hit(top - 0.5 * z * z)[1]
+        # rho / c = 1 / (n.d)
+        f = near * i * over
+        arm = lever + slope * near * (ny * B[1, k] - nx * B[2, k])
+        wf, wz = w * f * f, w * z * f
+        s0 += wf
+        s1 += wf * arm
+        s2 += wf * arm * arm
+        t0 += wz
+        t1 += wz * arm
+    return s0, s1, s2, t0, t1
 
 
 @jit
@@ -393,18 +421,12 @@ def normal_equations(
     edges: Array,
     pose: Array,
     rs: float,
-    p: Array,
-    d: Array,
-    r: Array,
+    B: Array,
     start: Ints,
     eye: Array,
-    lim: Array,
-    sigma: float,
-    lift: float,
+    soften: float,
     grazes: int,
-    spread: float,
-    table: Array,
-    scale: float,
+    bearing: float,
     rho: Array,
     face: Ints,
     H: Array,
@@ -412,58 +434,39 @@ def normal_equations(
 ) -> None:
     """Gauss-Newton system of the ranges in (tx, ty, theta * rs), rotation about the origin of ``edges``.
 
-    Weights a / (1 + a), a = A exp(-(d^2 + lift) / 2), from row 1 of ``table``. A face met nearly edge-on
+    Weights a / (1 + a), a = A / m exp(-d^2 / (2 m^2)), m = ``soften`` times sigma. A face met nearly edge-on
     counts from ``grazes`` returns on: the Jacobian of a few claims more than they say.
     """
-    n = p.shape[0]
-    for k in range(n):
-        rho[k] = lim[k]
+    for k in range(B.shape[1]):
+        rho[k] = B[LIMIT, k]
         face[k] = -1
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    predict(edges, cos, sin, pose[0], pose[1], p, d, start, eye, rho, face)
+    predict(edges, cos, sin, pose[0], pose[1], B, start, eye, rho, face)
     H[:] = 0.0
     g[:] = 0.0
-    inv = 1.0 / sigma
-    unit = 1.0 / scale
-    last = table.shape[1] - 1.5
-    weights = table[1]
+    soft, drop, slope = 1.0 / soften, math.log(soften), 1.0 / rs
     for q in range(eye.shape[0]):
         ox, oy = eye[q, 0] - pose[0], eye[q, 1] - pose[1]
         k, end = start[q], start[q + 1]
         while k < end:
             e = face[k]
+            first = k
+            k += 1
             if e < 0:
-                k += 1
                 continue
+            while k < end and face[k] == e:
+                k += 1
             # one stretch on one face: n.(a - o) is common to it, and so is the Jacobian's direction
             nx = cos * edges[e, 4] - sin * edges[e, 5]
             ny = sin * edges[e, 4] + cos * edges[e, 5]
-            nd = nx * d[0, k] + ny * d[1, k]
-            c = rho[k] * nd
+            nd = nx * B[1, first] + ny * B[2, first]
             steep = nd > -STEEP
-            first = k
-            lever, slope = (ny * ox - nx * oy) / rs, 1.0 / rs
-            s0 = s1 = s2 = t0 = t1 = 0.0
-            while k < end and face[k] == e:
-                z = (r[k] - rho[k]) * inv
-                x = min((z * z + lift) * unit, last)
-                # rho / c = 1 / (n.d)
-                f = rho[k] * inv / c
-                grow = 1.0
-                if steep:
-                    grow = 1.0 + spread * rho[k] * rho[k] * (rho[k] * rho[k] / (c * c) - 1.0)
-                    x = min((z * z / grow + lift) * unit + math.log(grow) * unit, last)
-                w = weights[int(x)] / grow
-                arm = lever + slope * rho[k] * (ny * d[0, k] - nx * d[1, k])
-                wf, wz = w * f * f, w * z * f
-                s0 += wf
-                s1 += wf * arm
-                s2 += wf * arm * arm
-                t0 += wz
-                t1 += wz * arm
-                k += 1
-            if steep and (k - first < grazes):
+            if steep and k - first < grazes:
                 continue
+            s0, s1, s2, t0, t1 = _stretch(
+                B, first, k, nx, ny, rho[first] * nd, (ny * ox - nx * oy) / rs, slope, soft, drop,
+                bearing if steep else 0.0, rho,
+            )  # fmt: skip
             H[0, 0] += nx * nx * s0
             H[0, 1] += nx * ny * s0
             H[1, 1] += ny * ny * s0
@@ -491,49 +494,22 @@ def solve3(H: Array, g: Array, x: Array) -> None:
 
 @jit
 def slide(
-    edges_a: Array,
-    edges_b: Array,
-    pose: Array,
-    steps: Array,
-    p: Array,
-    d: Array,
-    r: Array,
-    start: Ints,
-    eye: Array,
-    off: Array,
-    deep: Array,
-    margin: float,
-    sigma: float,
-    table: Array,
-    scale: float,
-    prior: float,
-    scores: Array,
-) -> None:
+    edges_a: Array, edges_b: Array, pose: Array, steps: Array, B: Array, start: Ints, eye: Array,
+    margin: float, prior: float, scores: Array,
+) -> None:  # fmt: skip
     """Score the union of both components at ``pose`` shifted by every (du, dv) row of ``steps``."""
-    n = p.shape[0]
+    n = B.shape[1]
     rho = np.empty(n)
     face = np.empty(n, np.int64)
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    unit = 1.0 / (sigma * sigma * scale)
-    last = table.shape[1] - 1.5
-    logs = table[0]
     for i in range(steps.shape[0]):
         rho[:] = np.inf
         face[:] = -1
         tx, ty = pose[0] + steps[i, 0], pose[1] + steps[i, 1]
-        predict(edges_a, cos, sin, tx, ty, p, d, start, eye, rho, face)
-        predict(edges_b, cos, sin, tx, ty, p, d, start, eye, rho, face)
-        total = -0.5 * (steps[i, 0] ** 2 + steps[i, 1] ** 2) / (prior * prior)
-        for k in range(n):
-            if face[k] < 0:
-                continue
-            e = r[k] - rho[k]
-            x = min(e * e * unit, last)
-            total += logs[int(x + 0.5)]
-            total += off[k]
-            if e > margin:
-                total += deep[k]
-        scores[i] = total
+        predict(edges_a, cos, sin, tx, ty, B, start, eye, rho, face)
+        predict(edges_b, cos, sin, tx, ty, B, start, eye, rho, face)
+        scores[i] = _total(B, margin, rho, face)
+        scores[i] -= 0.5 * (steps[i, 0] ** 2 + steps[i, 1] ** 2) / (prior * prior)
 
 
 @jit
@@ -554,19 +530,11 @@ def _log_prior(pose: Array, prior: Array) -> float:
 def posterior(
     edges: Array,
     rs: float,
-    p: Array,
-    d: Array,
-    r: Array,
+    B: Array,
     start: Ints,
     eye: Array,
-    off: Array,
-    deep: Array,
     margin: float,
-    lim: Array,
-    sigma: float,
-    spread: float,
-    table: Array,
-    scale: float,
+    bearing: float,
     prior: Array,
     begin: Array,
     window: float,
@@ -583,7 +551,7 @@ def posterior(
 
     Parameters
     ----------
-    spread : float
+    bearing : float
         See :func:`log_likelihood`.
     prior : (3,)
         Standard deviations of tx, ty (m) and theta (rad).
@@ -602,12 +570,12 @@ def posterior(
         rival mass, rival offset along the weak axis, log-likelihood at the mean, log-posterior at its mode,
         effective number of nodes, 1 where sampling replaced the quadrature.
     """
-    n = p.shape[0]
+    n = B.shape[1]
     rho = np.empty(n)
     face = np.empty(n, np.int64)
     H, g, pose = np.empty((3, 3)), np.empty(3), np.empty(3)
     pinv = np.array([1.0 / prior[0] ** 2, 1.0 / prior[1] ** 2, 1.0 / (prior[2] * rs) ** 2])
-    args = (edges, rs, p, d, r, start, eye, off, deep, margin, lim, sigma, spread, table, scale, prior, pinv)
+    args = (edges, rs, B, start, eye, margin, bearing, prior, pinv)
     q = np.array([begin[0], begin[1], begin[2] * rs])
     _pilot(args, q, rho, face, H, g, pose)
     nodes = 25
@@ -618,28 +586,8 @@ def posterior(
     mixed, step, top = False, 0.0, 0.0
     for _ in range(4):
         pose[0], pose[1], pose[2] = q[0], q[1], q[2] / rs
-        normal_equations(
-            edges,
-            pose,
-            rs,
-            p,
-            d,
-            r,
-            start,
-            eye,
-            lim,
-            sigma,
-            0.0,
-            NEVER,
-            spread,
-            table,
-            scale,
-            rho,
-            face,
-            H,
-            g,
-        )
-        mixed = _two_orientations(edges, face, r)
+        normal_equations(edges, pose, rs, B, start, eye, 1.0, NEVER, bearing, rho, face, H, g)
+        mixed = _two_orientations(edges, face, B[RANGE])
         raw[:] = H
         for i in range(3):
             H[i, i] += pinv[i]
@@ -677,9 +625,7 @@ def posterior(
     info[2], info[3], info[4] = axes[0, 0], axes[1, 0], axes[2, 0]
     info[5] = math.sqrt(max(_along(cov, axes), 0.0))
     pose[0], pose[1], pose[2] = mean[0], mean[1], mean[2] / rs
-    info[8] = log_likelihood(
-        edges, pose, p, d, r, start, eye, off, deep, margin, lim, sigma, spread, table, scale, rho, face
-    )
+    info[8] = log_likelihood(edges, pose, B, start, eye, margin, bearing, rho, face)
 
 
 @jit
@@ -688,21 +634,13 @@ def component(
     at: Array,
     begin: Array,
     use: NDArray[np.bool_],
-    p: Array,
-    d: Array,
-    r: Array,
+    every: Array,
     start: Ints,
     eye: Array,
-    off: Array,
-    deep: Array,
     margin: float,
-    lim: Array,
     near: float,
     few: int,
-    sigma: float,
-    spread: float,
-    table: Array,
-    scale: float,
+    bearing: float,
     prior: Array,
     window: float,
     least: float,
@@ -726,30 +664,30 @@ def component(
     n = 0
     for k in range(use.shape[0]):
         n += int(use[k])
-    p2, d2, r2 = np.empty(n), np.empty((2, n)), np.empty(n)
-    off2, deep2, lim2 = np.empty(n), np.empty(n), np.empty(n)
+    B = np.empty((every.shape[0], n))
     start2 = np.empty(start.shape[0], np.int64)
     i = 0
     for g in range(eye.shape[0]):
         start2[g] = i
         for k in range(start[g], start[g + 1]):
             if use[k]:
-                p2[i], d2[0, i], d2[1, i], r2[i] = p[k], d[0, k], d[1, k], r[k]
-                off2[i], deep2[i], lim2[i] = off[k], deep[k], lim[k]
+                for j in range(every.shape[0]):
+                    B[j, i] = every[j, k]
                 i += 1
     start2[start.shape[0] - 1] = i
     rho, face = np.full(n, np.inf), np.full(n, -1, np.int64)
     cos, sin = math.cos(at[2]), math.sin(at[2])
-    predict(rows, cos, sin, at[0], at[1], p2, d2, start2, eye, rho, face)
-    count, px, py = 0, 0.0, 0.0
+    predict(rows, cos, sin, at[0], at[1], B, start2, eye, rho, face)
+    count, px, py, slack = 0, 0.0, 0.0, 0.003
     points = np.empty((n, 2))
     for g in range(eye.shape[0]):
         for k in range(start2[g], start2[g + 1]):
-            if face[k] >= 0 and r2[k] > 0.0 and abs(r2[k] - rho[k]) < near:
-                points[count, 0] = eye[g, 0] + d2[0, k] * r2[k]
-                points[count, 1] = eye[g, 1] + d2[1, k] * r2[k]
+            if face[k] >= 0 and B[RANGE, k] > 0.0 and abs(B[RANGE, k] - rho[k]) < near:
+                points[count, 0] = eye[g, 0] + B[1, k] * B[RANGE, k]
+                points[count, 1] = eye[g, 1] + B[2, k] * B[RANGE, k]
                 px += points[count, 0]
                 py += points[count, 1]
+                slack = max(slack, 1.0 / B[INVERSE, k])
                 count += 1
     if count < few:
         return False
@@ -774,11 +712,11 @@ def component(
     first, mean, cov, info = np.zeros(3), np.empty(3), np.empty((3, 3)), np.zeros(12)
     out[12], out[13], out[35] = px, py, rs
     posterior(
-        moved, rs, p2, d2, r2, start2, seat, off2, deep2, margin, lim2, sigma, spread, table, scale, prior,
-        first, window, least, cells, draws, mean, cov, info,
+        moved, rs, B, start2, seat, margin, bearing, prior, first, window, least, cells, draws, mean, cov,
+        info,
     )  # fmt: skip
     _put(at, mean, cov, info, out)
-    if math.isnan(begin[0]) or not _apart(begin, out, max(0.003, sigma)):
+    if math.isnan(begin[0]) or not _apart(begin, out, slack):
         return True
     turn = begin[2] - at[2]
     first[0] = begin[0] - px - (math.cos(turn) * lx - math.sin(turn) * ly)
@@ -787,8 +725,8 @@ def component(
     before = info[0]
     info[:] = 0.0
     posterior(
-        moved, rs, p2, d2, r2, start2, seat, off2, deep2, margin, lim2, sigma, spread, table, scale, prior,
-        first, window, least, cells, draws, mean, cov, info,
+        moved, rs, B, start2, seat, margin, bearing, prior, first, window, least, cells, draws, mean, cov,
+        info,
     )  # fmt: skip
     if info[0] > before + 1.0:
         _put(at, mean, cov, info, out)
@@ -845,24 +783,21 @@ def _along(m: Array, axes: Array) -> float:
 @jit
 def _pilot(args: tuple[Any, ...], q: Array, rho: Array, face: Ints, H: Array, g: Array, pose: Array) -> None:
     """Six annealed Gauss-Newton steps from q; q becomes the best place passed."""
-    edges, rs, p, d, r, start, eye, off, deep, margin, lim, sigma, spread, table, scale, prior, pinv = args
+    edges, rs, B, start, eye, margin, bearing, prior, pinv = args
     x, at = np.empty(3), q.copy()
     top = -np.inf
     for it in range(7):
         pose[0], pose[1], pose[2] = at[0], at[1], at[2] / rs
-        value = log_likelihood(
-            edges, pose, p, d, r, start, eye, off, deep, margin, lim, sigma, spread, table, scale, rho, face
-        ) + _log_prior(pose, prior)
+        value = log_likelihood(edges, pose, B, start, eye, margin, bearing, rho, face) + _log_prior(
+            pose, prior
+        )
         if value > top:
             top = value
             q[:] = at
         if it == 6:
             break
         m = 4.0 if it < 2 else (2.0 if it < 4 else 1.0)
-        lift, s = 2.0 * math.log(m), m * sigma
-        normal_equations(
-            edges, pose, rs, p, d, r, start, eye, lim, s, lift, NEVER, spread, table, scale, rho, face, H, g
-        )
+        normal_equations(edges, pose, rs, B, start, eye, m, NEVER, bearing, rho, face, H, g)
         for i in range(3):
             H[i, i] += 1.1 * pinv[i]
             g[i] -= pinv[i] * at[i]
@@ -876,7 +811,7 @@ def _profile(
     best: Array,
 ) -> float:  # fmt: skip
     """Log marginal along the weak direction, from the middle node outwards; returns its maximum."""
-    edges, rs, p, d, r, start, eye, off, deep, margin, lim, sigma, spread, table, scale, prior, _ = args
+    edges, rs, B, start, eye, margin, bearing, prior, _ = args
     H, g, pose, L = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((2, 2))
     nodes = best.shape[0]
     mid = nodes // 2
@@ -890,9 +825,7 @@ def _profile(
         for _ in range(2):
             _conditional_step(args, q, axes, (i - mid) * step, w[i], P2, rho, face, H, g, pose, L)
         _pose_at(q, axes, (i - mid) * step, w[i, 0], w[i, 1], rs, pose)
-        value = log_likelihood(
-            edges, pose, p, d, r, start, eye, off, deep, margin, lim, sigma, spread, table, scale, rho, face
-        )
+        value = log_likelihood(edges, pose, B, start, eye, margin, bearing, rho, face)
         best[i] = value + _log_prior(pose, prior) - math.log(L[0, 0] * L[1, 1])
     return float(best.max())
 
@@ -927,11 +860,9 @@ def _conditional_step(
     L: Array,
 ) -> None:
     """One Gauss-Newton step of w at fixed s; L becomes the Cholesky factor of its information."""
-    edges, rs, p, d, r, start, eye, _, _, _, lim, sigma, spread, table, scale, _, pinv = args
+    edges, rs, B, start, eye, _, bearing, _, pinv = args
     _pose_at(q, axes, s, w[0], w[1], rs, pose)
-    normal_equations(
-        edges, pose, rs, p, d, r, start, eye, lim, sigma, 0.0, 2, spread, table, scale, rho, face, H, g
-    )
+    normal_equations(edges, pose, rs, B, start, eye, 1.0, 2, bearing, rho, face, H, g)
     pose[2] *= rs
     for i in range(3):
         g[i] -= pinv[i] * pose[i]
@@ -974,7 +905,7 @@ def _integrate(
     info: Array,
 ) -> None:
     """Moments by midpoints along u and Gauss-Hermite across (METHOD, section 4, step 8)."""
-    edges, rs, p, d, r, start, eye, off, deep, margin, lim, sigma, spread, table, scale, prior, _ = args
+    edges, rs, B, start, eye, margin, bearing, prior, _ = args
     if mixed:
         xs = np.array([0.0, 1.3556261799742659, -1.3556261799742659, 2.8569700138728056, -2.8569700138728056])
         lw = np.log(
@@ -987,7 +918,7 @@ def _integrate(
         lw = np.log(np.array([2.0 / 3.0, 1.0 / 6.0, 1.0 / 6.0]))
     if hi - lo > 0.008:
         cells *= 2
-    n = p.shape[0]
+    n = B.shape[1]
     rho = np.empty(n)
     face = np.empty(n, np.int64)
     H, g, pose = np.empty((3, 3)), np.empty(3), np.empty(3)
@@ -1018,23 +949,7 @@ def _integrate(
                     y0 = (xs[a] - L[1, 0] * y1) / L[0, 0]
                     _pose_at(q, axes, s, wc[0] + y0, wc[1] + y1, rs, pose)
                     value = log_likelihood(
-                        edges,
-                        pose,
-                        p,
-                        d,
-                        r,
-                        start,
-                        eye,
-                        off,
-                        deep,
-                        margin,
-                        lim,
-                        sigma,
-                        spread,
-                        table,
-                        scale,
-                        rho,
-                        face,
+                        edges, pose, B, start, eye, margin, bearing, rho, face
                     ) + _log_prior(pose, prior)
                     mode = max(mode, value)
                     values[count] = value + 0.5 * (xs[a] * xs[a] + xs[b] * xs[b]) + lw[a] + lw[b] + base
@@ -1138,10 +1053,10 @@ def _sample(
     Returns that graze a deep face, or two visible ends, can pin a component to a sliver that lies askew
     to the weak direction. The likelihood is raised to a power that grows to 1 as the proposal adapts.
     """
-    edges, rs, p, d, r, start, eye, off, deep, margin, lim, sigma, spread, table, scale, prior, _ = args
+    edges, rs, B, start, eye, margin, bearing, prior, _ = args
     n = draws.shape[0]
-    rho = np.empty(p.shape[0])
-    face = np.empty(p.shape[0], np.int64)
+    rho = np.empty(B.shape[1])
+    face = np.empty(B.shape[1], np.int64)
     pose = np.empty(3)
     centre = q.copy()
     shape = 2.0 * np.linalg.inv(H)
@@ -1156,25 +1071,7 @@ def _sample(
                 for b in range(a + 1):
                     x[i, a] += L[a, b] * draws[i, b]
             pose[0], pose[1], pose[2] = x[i, 0], x[i, 1], x[i, 2] / rs
-            target[i] = log_likelihood(
-                edges,
-                pose,
-                p,
-                d,
-                r,
-                start,
-                eye,
-                off,
-                deep,
-                margin,
-                lim,
-                sigma,
-                spread,
-                table,
-                scale,
-                rho,
-                face,
-            )
+            target[i] = log_likelihood(edges, pose, B, start, eye, margin, bearing, rho, face)
             before[i] = _log_prior(pose, prior)
         low, power = power, 1.0
         for _ in range(12):

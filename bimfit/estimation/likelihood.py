@@ -22,7 +22,6 @@ from bimfit.geometry.slice import Beams
 
 Ints = NDArray[np.int64]
 _SHARE_FLOOR = 1e-3
-_TABLE = 2048
 _MISSING = -1e9
 
 
@@ -40,16 +39,12 @@ class BeamModel:
         log(e_m / (1 - e_m - e_o)): what a beam that returned nothing says against a face in its way.
     past : float
         The same for a beam that went past and returned from behind.
-    table, scale : ndarray, shape (2, 2048), and float
-        The logarithm above and a / (1 + a), a = A exp(-d^2 / 2), at d^2 = index * scale.
     """
 
     sigma: float
     amplitude: float
     miss: float
     past: float
-    table: Array
-    scale: float
 
     @classmethod
     def of(
@@ -65,11 +60,8 @@ def _model(sensor: SensorConfig, sigma: float | None, outliers: float | None) ->
     e_o = max(sensor.outlier_share if outliers is None else outliers, _SHARE_FLOOR)
     e_m = max(sensor.miss_share, _SHARE_FLOOR)
     amplitude = max(1.0 - e_o - e_m, 0.05) * sensor.max_range / (e_o * s * math.sqrt(2.0 * math.pi))
-    table = np.empty((2, _TABLE))
-    scale = 2.0 * math.log(max(amplitude, 2.0) / 1e-3) / (_TABLE - 1)
-    _kernels.log_table(amplitude, scale, table)
     past = min(math.log(e_m / max(1.0 - e_m - e_o, 0.05)), 0.0)
-    return BeamModel(s, amplitude, past if sensor.missing_means_gap else 0.0, past, table, scale)
+    return BeamModel(s, amplitude, past if sensor.missing_means_gap else 0.0, past)
 
 
 @dataclass(frozen=True)
@@ -78,16 +70,17 @@ class BeamSet:
 
     Attributes
     ----------
-    p, d, r : ndarray, shape (n,), (2, n), (n,)
-        Pseudo-angle, direction, range (negative where nothing came back).
+    rays : ndarray, shape (3, n)
+        Pseudo-angle and direction.
+    r : ndarray, shape (n,)
+        Range, negative where nothing came back.
     start, eye : ndarray, shape (g + 1,), (g, 4)
         First beam of every group of one origin; its origin and look direction.
     order : ndarray, shape (n,)
         Index of every beam in what it was made from.
     """
 
-    p: Array
-    d: Array
+    rays: Array
     r: Array
     start: Ints
     eye: Array
@@ -109,23 +102,21 @@ class BeamSet:
             _, group = np.unique(np.round(o / 1e-7).astype(np.int64), axis=0, return_inverse=True)
             group = np.asarray(group, np.int64).reshape(-1)
         count = int(group.max()) + 1 if n else 0
-        eye = np.empty((count, 4))
-        p = np.empty(n)
+        eye, rays = np.empty((count, 4)), np.empty((3, n))
         order = np.empty(n, np.int64)
         start = np.zeros(count + 1, np.int64)
-        _kernels.sort_beams(o, d, group, count, eye, p, order, start)
-        sorted_d = np.ascontiguousarray(d[order].T)
-        return cls(p, sorted_d, np.ascontiguousarray(r[order]), start, eye, whole[order])
+        _kernels.sort_beams(o, d, group, count, eye, rays[0], order, start)
+        rays[1:] = d[order].T
+        return cls(rays, np.ascontiguousarray(r[order]), start, eye, whole[order])
 
     def __len__(self) -> int:
-        return len(self.p)
+        return len(self.r)
 
     def take(self, keep: NDArray[np.bool_]) -> BeamSet:
         """The beams for which ``keep`` holds; groups left empty stay."""
         before = np.concatenate([[0], np.cumsum(keep)]).astype(np.int64)
         return BeamSet(
-            self.p[keep],
-            np.ascontiguousarray(self.d[:, keep]),
+            np.ascontiguousarray(self.rays[:, keep]),
             self.r[keep],
             before[self.start],
             self.eye,
@@ -136,7 +127,17 @@ class BeamSet:
         """The same beams in coordinates whose origin is ``pivot``."""
         eye = self.eye.copy()
         eye[:, :2] -= pivot
-        return BeamSet(self.p, self.d, self.r, self.start, eye, self.order)
+        return BeamSet(self.rays, self.r, self.start, eye, self.order)
+
+    @property
+    def p(self) -> Array:
+        """Pseudo-angles, ascending within a group, shape (n,)."""
+        return np.asarray(self.rays[0])
+
+    @property
+    def d(self) -> Array:
+        """Unit directions, shape (2, n)."""
+        return np.asarray(self.rays[1:])
 
     @cached_property
     def spacing(self) -> float:
@@ -184,5 +185,5 @@ def predict_ranges(rows: Array, beams: BeamSet) -> tuple[Array, Ints]:
     """
     rho = np.full(len(beams), np.inf)
     face = np.full(len(beams), -1, np.int64)
-    _kernels.predict(rows, 1.0, 0.0, 0.0, 0.0, beams.p, beams.d, beams.start, beams.eye, rho, face)
+    _kernels.predict(rows, 1.0, 0.0, 0.0, 0.0, beams.rays, beams.start, beams.eye, rho, face)
     return rho, face

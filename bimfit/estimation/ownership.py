@@ -7,6 +7,7 @@ passes between them, a second round repeats each posterior given the other compo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -42,9 +43,7 @@ class Scene:
         """Predict both components, given by their edges (m, 6) as designed."""
         ranges, faces = np.empty((2, len(beams))), np.empty((2, len(beams)), np.int64)
         a, b = poses
-        _kernels.scene(
-            *rows, a.as_array(), b.as_array(), beams.p, beams.d, beams.start, beams.eye, ranges, faces
-        )
+        _kernels.scene(*rows, a.as_array(), b.as_array(), beams.rays, beams.start, beams.eye, ranges, faces)
         return cls(ranges, faces)
 
     @property
@@ -118,6 +117,15 @@ class Cost:
         return Cost(self.off[keep], self.deep[keep], self.margin, self.limit[keep])
 
 
+def packed(beams: BeamSet, cost: Cost, model: BeamModel) -> Array:
+    """Beams and what is known of each, shape (9, n), as the kernels' likelihood takes them."""
+    out = np.empty((9, len(beams)))
+    out[:3], out[_kernels.RANGE] = beams.rays, beams.r
+    out[_kernels.OFF], out[_kernels.DEEP], out[_kernels.LIMIT] = cost.off, cost.deep, cost.limit
+    out[_kernels.INVERSE], out[_kernels.TOP] = 1.0 / model.sigma, math.log(model.amplitude)
+    return out
+
+
 def cover_cost(beams: BeamSet, model: BeamModel, margin: float) -> Cost:
     """Cost of covering beams when nothing is known of the other component.
 
@@ -187,7 +195,9 @@ def through(corners: tuple[Array, Array], beams: BeamSet, nearest: Array, depth:
         0 as well where fewer than half of the beams between the corners did so: then something is there.
     """
     return int(
-        _kernels.through(np.array(corners), beams.p, beams.r, beams.start, beams.eye, nearest, depth, sigma)
+        _kernels.through(
+            np.array(corners), beams.rays, beams.r, beams.start, beams.eye, nearest, depth, sigma
+        )
     )
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bimfit.estimation import _kernels
 from bimfit.estimation.likelihood import BeamModel, BeamSet
-from bimfit.estimation.ownership import Cost
+from bimfit.estimation.ownership import Cost, packed
 from bimfit.geometry.pose import Array, Pose2D
 
 _CELLS = 24
@@ -129,14 +129,13 @@ def component_posterior(
     Posterior or None
         None where hardly any return lies on the component.
     """
-    spread = (_BEARING * beams.spacing / model.sigma) ** 2
     other = _NOWHERE if begin is None else begin.as_array()
     out = np.empty(36)
     found = _kernels.component(
-        rows, start.as_array(), other, np.ones(len(beams), bool) if use is None else use, beams.p, beams.d,
-        beams.r, beams.start, beams.eye, cost.off, cost.deep, cost.margin, cost.limit, _NEAR, _MIN_HITS,
-        model.sigma, spread, model.table, model.scale, np.array([window.shift, window.shift, window.angle]),
-        window.reach, window.least, _CELLS, _draws(), out,
+        rows, start.as_array(), other, np.ones(len(beams), bool) if use is None else use,
+        packed(beams, cost, model), beams.start, beams.eye, cost.margin, _NEAR, _MIN_HITS,
+        _BEARING * beams.spacing, np.array([window.shift, window.shift, window.angle]), window.reach,
+        window.least, _CELLS, _draws(), out,
     )  # fmt: skip
     if not found:
         return None

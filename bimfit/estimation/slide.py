@@ -11,7 +11,7 @@ import numpy as np
 from bimfit.config import FitConfig, SensorConfig
 from bimfit.estimation import _kernels
 from bimfit.estimation.likelihood import BeamModel, BeamSet, edge_rows
-from bimfit.estimation.ownership import Cost
+from bimfit.estimation.ownership import Cost, packed
 from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.pose import Array, Pose2D
 
@@ -71,9 +71,8 @@ def slide_combined(
     scores = np.empty(len(shifts))
     a, b = (edge_rows(component) for component in section.components)
     _kernels.slide(
-        a, b, pose.as_array(), shifts[:, None] * axis, beams.p, beams.d, beams.r, beams.start, beams.eye,
-        cost.off, cost.deep, cost.margin,
-        model.sigma, model.table, model.scale, min(_PRIOR, max(0.8 * gap, 0.010)), scores,
+        a, b, pose.as_array(), shifts[:, None] * axis, packed(beams, cost, model), beams.start, beams.eye,
+        cost.margin, min(_PRIOR, max(0.8 * gap, 0.010)), scores,
     )  # fmt: skip
     best = int(np.argmax(scores))
     moved = Pose2D(pose.u + shifts[best] * axis[0], pose.v + shifts[best] * axis[1], pose.theta)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
+import scipy
 import shapely
 
 from bimfit.config import SensorConfig
 from bimfit.estimation import _kernels
 from bimfit.estimation.likelihood import BeamModel, BeamSet, edge_rows, predict_ranges
-from bimfit.estimation.ownership import Cost
+from bimfit.estimation.ownership import Cost, packed
 from bimfit.estimation.posterior import Window, component_posterior
 from bimfit.geometry.pose import Pose2D
 from bimfit.geometry.profile import Profile
@@ -114,10 +116,10 @@ def test_information_of_a_flat_face_is_the_closed_form():
     # rotation about the sensor, as the closed form has it
     local = set_.moved_origin(np.array([0.0, 0.25]))
     rows = edge_rows(BOARD, Pose2D(0.0, -0.25, 0.0))
+    exact = dataclasses.replace(local, r=np.where(top, rho, -1e9))
     _kernels.normal_equations(
-        rows, np.zeros(3), 1.0, local.p, local.d, np.where(top, rho, -1e9), local.start, local.eye,
-        cost.limit, model.sigma, 0.0, 1 << 40, 0.0, model.table, model.scale, np.empty(n),
-        np.empty(n, np.int64), H, b,
+        rows, np.zeros(3), 1.0, packed(exact, cost, model), local.start, local.eye, 1.0, 1 << 40, 0.0,
+        np.empty(n), np.empty(n, np.int64), H, b,
     )  # fmt: skip
     assert np.allclose(np.abs(H), np.abs(expected), rtol=1e-3, atol=1e-3 * np.abs(expected).max())
     assert np.allclose(np.diag(H), np.diag(expected), rtol=1e-3)
@@ -132,10 +134,9 @@ def _lattice(rows, pivot, radius, set_, model, cost, window, around, half, n=41)
     moved[:, 0:2] -= pivot
     moved[:, 2:4] -= pivot
     rho, face = np.empty(len(set_)), np.empty(len(set_), np.int64)
-    spread = (0.05 * set_.spacing / model.sigma) ** 2
-    before = (local.p, local.d, local.r, local.start, local.eye, cost.off, cost.deep, cost.margin, cost.limit)
-    after = (model.sigma, spread, model.table, model.scale, rho, face)
-    value = np.array([_kernels.log_likelihood(moved, x, *before, *after) for x in X])
+    after = (local.start, local.eye, cost.margin, 0.05 * set_.spacing, rho, face)
+    B = packed(local, cost, model)
+    value = np.array([_kernels.log_likelihood(moved, x, B, *after) for x in X])
     value -= 0.5 * np.sum((X / (window.shift, window.shift, window.angle)) ** 2, axis=1)
     w = np.exp(value - value.max())
     w /= w.sum()
@@ -179,22 +180,29 @@ def test_kernels_do_what_their_python_does():
     rows = edge_rows(BOARD)
     n = len(set_)
     rho, face = np.full(n, np.inf), np.full(n, -1, np.int64)
-    args = (rows, math.cos(0.02), math.sin(0.02), 1e-3, -2e-3, set_.p, set_.d, set_.start, set_.eye)
+    args = (rows, math.cos(0.02), math.sin(0.02), 1e-3, -2e-3, set_.rays, set_.start, set_.eye)
     _kernels.predict(*args, rho, face)
     slow, slow_face = np.full(n, np.inf), np.full(n, -1, np.int64)
     _kernels.predict.py_func(*args, slow, slow_face)
     assert np.array_equal(face, slow_face)
     assert np.allclose(rho[face >= 0], slow[face >= 0], rtol=1e-12)
-    beams = (set_.p, set_.d, set_.r, set_.start, set_.eye, cost.off, cost.deep, cost.margin, cost.limit)
-    common = (rows, np.array([1e-3, -2e-3, 0.02]), *beams, model.sigma, 0.1, model.table, model.scale)
-    fast = _kernels.log_likelihood(*common, rho, face)
-    assert fast == pytest.approx(_kernels.log_likelihood.py_func(*common, rho, face), rel=1e-12)
+    B = packed(set_, cost, model)
+    common = (rows, np.array([1e-3, -2e-3, 0.02]), B, set_.start, set_.eye, cost.margin)
+    fast = _kernels.log_likelihood(*common, 3e-4, rho, face)
+    assert fast == pytest.approx(_kernels.log_likelihood.py_func(*common, 3e-4, rho, face), rel=1e-12)
     covered = face >= 0
     d2 = ((set_.r - rho) / model.sigma) ** 2
     a = model.amplitude * np.exp(-0.5 * d2)
     naive = np.sum(np.where(covered, np.log1p(a) + cost.off, 0.0))
-    flat = _kernels.log_likelihood(*common[:12], 0.0, *common[13:], rho, face)
-    assert flat == pytest.approx(naive, abs=0.3)
+    flat = _kernels.log_likelihood(*common, 0.0, rho, face)
+    assert flat == pytest.approx(naive, abs=1e-3)
+
+
+def test_the_likelihood_of_one_return_is_the_softplus_of_its_odds():
+    t = np.r_[-np.inf, np.linspace(-60.0, 60.0, 4001)]
+    found = np.array([_kernels._hit(x) for x in t])
+    assert np.allclose(found[:, 0], np.logaddexp(0.0, t), atol=2e-5)
+    assert np.allclose(found[:, 1], scipy.special.expit(t), atol=2e-5)
 
 
 def test_a_return_from_behind_counts_only_where_something_should_have_stopped_it():
@@ -204,15 +212,9 @@ def test_a_return_from_behind_counts_only_where_something_should_have_stopped_it
     rho, face = predict_ranges(rows, set_)
     covered = face >= 0
     behind = np.where(np.isfinite(rho), rho + 0.1, 0.6)
-    common = (set_.p, set_.d, behind, set_.start, set_.eye, np.zeros(n), np.full(n, model.past), 0.012)
-    tail = (
-        np.full(n, np.inf),
-        model.sigma,
-        0.0,
-        model.table,
-        model.scale,
-        np.empty(n),
-        np.empty(n, np.int64),
+    cost = Cost(np.zeros(n), np.full(n, model.past), 0.012, np.full(n, np.inf))
+    B = packed(dataclasses.replace(set_, r=behind), cost, model)
+    total = _kernels.log_likelihood(
+        rows, np.zeros(3), B, set_.start, set_.eye, cost.margin, 0.0, np.empty(n), np.empty(n, np.int64)
     )
-    total = _kernels.log_likelihood(rows, np.zeros(3), *common, *tail)
     assert total == pytest.approx(model.past * covered.sum(), rel=1e-9)
