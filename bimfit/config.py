@@ -180,6 +180,40 @@ class FitConfig:
 
 
 @dataclass(frozen=True)
+class ShapeConfig:
+    """How far components may differ in shape from their design; 0 holds a freedom fixed.
+
+    Attributes
+    ----------
+    bevel_angle, face_angle : float
+        Prior standard deviations of the angle of the face in the gap and of the outer face beside it, rad.
+    thickness : float
+        Of a component's thickness, m.
+    limit : float
+        No freedom goes farther than so many of its prior standard deviations; a station that gets there is
+        ``weak``.
+    """
+
+    bevel_angle: float = 0.0
+    face_angle: float = 0.0
+    thickness: float = 0.0
+    limit: float = 3.0
+
+    def __post_init__(self) -> None:
+        _positive(self, "limit")
+        for name, most in (("bevel_angle", 0.5), ("face_angle", 0.5), ("thickness", 0.5)):
+            value = getattr(self, name)
+            if not 0.0 <= value <= most:
+                raise ConfigError(f"{name} must lie in [0, {most}], got {value}")
+
+    @property
+    def freedoms(self) -> dict[str, float]:
+        """The freedoms that are not fixed, by their names on the command line, and their priors."""
+        named = {"bevel-angle": self.bevel_angle, "face-angle": self.face_angle, "thickness": self.thickness}
+        return {name: sd for name, sd in named.items() if sd > 0.0}
+
+
+@dataclass(frozen=True)
 class SliceConfig:
     """How a scan is cut into slices.
 
@@ -245,6 +279,7 @@ class Config:
     slices: SliceConfig = field(default_factory=SliceConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
     fit: FitConfig = field(default_factory=FitConfig)
+    shape: ShapeConfig = field(default_factory=ShapeConfig)
 
 
 def from_dict(kind: type[T], values: dict[str, Any], place: str = "") -> T:

@@ -49,6 +49,12 @@ def run(
         None, "--thickness", help="Thickness of a cloud's slices, such as 10mm."
     ),
     sigma: str | None = typer.Option(None, "--sigma", help="The sensor's range noise, such as 3mm."),
+    shape: str | None = typer.Option(
+        None,
+        "--shape",
+        metavar="FREEDOMS",
+        help="Free the components' shapes, with priors: bevel-angle=2deg,face-angle=1deg,thickness=1mm.",
+    ),
     config: Path | None = typer.Option(None, "--config", metavar="FILE.toml", help="Settings."),
     pictures: bool = typer.Option(True, help="Draw pictures."),
     report: bool = typer.Option(True, help="Write report.html."),
@@ -69,7 +75,13 @@ def run(
     from bimfit.pipeline.survey import survey
 
     settings = build_config(
-        config, window=window, tolerance=tolerance, spacing=spacing, thickness=thickness, sigma=sigma
+        config,
+        window=window,
+        tolerance=tolerance,
+        spacing=spacing,
+        thickness=thickness,
+        sigma=sigma,
+        shape=shape,
     )
     wanted = Deliverables(
         pictures=pictures,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bimfit.config import Config, JointConfig, Triple, load_config
+from bimfit.config import Config, JointConfig, ShapeConfig, Triple, load_config
 from bimfit.errors import ConfigError
 from bimfit.geometry.pose import Array
 
@@ -90,6 +90,7 @@ def build_config(
     spacing: str | None = None,
     thickness: str | None = None,
     sigma: str | None = None,
+    shape: str | None = None,
 ) -> Config:
     """Settings from a TOML file, with what the command line says on top.
 
@@ -110,7 +111,29 @@ def build_config(
         slices = dataclasses.replace(slices, thickness=length(thickness, "--thickness"))
     if sigma:
         sensor = dataclasses.replace(sensor, sigma=length(sigma, "--sigma"), adapt=False)
-    return dataclasses.replace(config, search=search, slices=slices, sensor=sensor)
+    freedoms = shape_config(shape, config.shape) if shape else config.shape
+    return dataclasses.replace(config, search=search, slices=slices, sensor=sensor, shape=freedoms)
+
+
+def shape_config(text: str, base: ShapeConfig | None = None) -> ShapeConfig:
+    """Shape freedoms from ``bevel-angle=2deg,face-angle=1deg,thickness=1mm``: prior standard deviations.
+
+    Raises
+    ------
+    ConfigError
+        For a freedom that does not exist or a value that is none.
+    """
+    known = {"bevel-angle": angle, "face-angle": angle, "thickness": length}
+    values: dict[str, float] = {}
+    for word in text.split(","):
+        name, _, value = word.strip().partition("=")
+        if name not in known or not value:
+            raise ConfigError(
+                f"--shape {text}: {word.strip() or 'nothing'} is no freedom with a value",
+                remedy="such as --shape bevel-angle=2deg,face-angle=1deg,thickness=1mm",
+            )
+        values[name.replace("-", "_")] = known[name](value, f"--shape {name}")
+    return dataclasses.replace(base or ShapeConfig(), **values)
 
 
 def joint_config(max_gap: str | None, base: JointConfig | None = None) -> JointConfig:

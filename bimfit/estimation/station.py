@@ -34,6 +34,7 @@ from bimfit.estimation.result import ComponentEstimate, Residuals, StationEstima
 from bimfit.estimation.slide import SlideResult, best_start, designed_width
 from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.pose import Array, Pose2D
+from bimfit.geometry.profile import Profile
 from bimfit.geometry.slice import Slice
 from bimfit.geometry.status import Status
 
@@ -127,17 +128,8 @@ def _estimated(
     rivals: Sequence[Pose2D],
 ) -> StationEstimate:
     """The estimate of a slice that has enough returns and a combined pose."""
-    virtual = None
-    if slice_.beams is None or len(slice_.beams.ranges) == 0:
-        virtual = virtual_beams(slice_, section, combined, sensor)
-        beams = BeamSet.of(virtual.beams)
-        if not virtual.spacing_known:
-            sensor = irregular_sensor(sensor)
-    else:
-        beams = BeamSet.of(slice_.beams)
-    rows = (edge_rows(section.components[0]), edge_rows(section.components[1]))
-    context = _Context(section, beams, rows, BeamModel.of(sensor), sensor, fit, virtual is not None)
-    reason = virtual.reason if virtual else ""
+    context, reason = _context(section, slice_, combined, sensor, fit)
+    beams, sensor = context.beams, context.sensor
     best, cost = _placed(context, slice_, combined, component_matches, rivals, reason)
     best = with_inside(best, section, beams, sensor.sigma, slice_.sweeps)
     if not best.status.measured or best.combined is None:
@@ -148,6 +140,66 @@ def _estimated(
         other = _components(context, slice_, there, cost, (None, None), reason)
         others.append(with_inside(other, section, beams, sensor.sigma, slice_.sweeps))
     return with_lookalikes(best, others, fit.joint_sigma)
+
+
+def _context(
+    section: JointSection, slice_: Slice, combined: Pose2D, sensor: SensorConfig, fit: FitConfig
+) -> tuple[_Context, str]:
+    """What every step needs, and why a hole between points is no evidence (empty where it is)."""
+    virtual = None
+    if slice_.beams is None or len(slice_.beams.ranges) == 0:
+        virtual = virtual_beams(slice_, section, combined, sensor)
+        beams = BeamSet.of(virtual.beams)
+        if not virtual.spacing_known:
+            sensor = irregular_sensor(sensor)
+    else:
+        beams = BeamSet.of(slice_.beams)
+    rows = (edge_rows(section.components[0]), edge_rows(section.components[1]))
+    context = _Context(section, beams, rows, BeamModel.of(sensor), sensor, fit, virtual is not None)
+    return context, virtual.reason if virtual else ""
+
+
+def reshaped(
+    section: JointSection,
+    slice_: Slice,
+    station: StationEstimate,
+    which: int,
+    profiles: Sequence[Profile],
+    sensor: SensorConfig,
+    fit: FitConfig,
+) -> list[Posterior | None]:
+    """Posteriors of one component for each of several shapes, from the same beams, the other component held.
+
+    Parameters
+    ----------
+    station : StationEstimate
+        The same slice, estimated before.
+    profiles : sequence of Profile
+        Shapes to try; their evidences compare.
+    """
+    pose = station.combined
+    if pose is None or station.components[which].pose is None:
+        return [None] * len(profiles)
+    context, _ = _context(section, slice_, pose, sensor, fit)
+    beams = context.beams
+    scene = _scene(context, (pose, pose))
+    side = split_side(scene, beams, np.array([pose.u, pose.v]))
+    usable = _usable(context, scene, side, pose)
+    poses = [pose if c.pose is None else c.pose for c in station.components]
+    scene = _scene(context, poses)
+    shallow = pose.inverse().apply(beams.points)[:, 1] > -3.0 * context.sensor.sigma
+    passed = _through(context, poses, scene)
+    cost = cover_cost(beams, context.model, _depth(context))
+    use, spent = second_round(
+        which, scene, side, beams, cost, context.model, territory=shallow & (passed > 0)
+    )
+    window, begin = _window(context), station.components[which].pose
+    return [
+        component_posterior(
+            edge_rows(profile), pose, beams, spent, context.model, window, use=use & usable, begin=begin
+        )
+        for profile in profiles
+    ]
 
 
 def _placed(

@@ -24,6 +24,7 @@ from bimfit.geometry.pose import Pose2D
 from bimfit.geometry.slice import Slice
 from bimfit.geometry.status import Status
 from bimfit.pipeline.records import ComponentResult, JointResult, StationResult
+from bimfit.pipeline.shape import StationShape, free_shapes, freedoms, judged, with_shape_sigma
 from bimfit.pipeline.stitch import stitch
 from bimfit.pipeline.targets import (
     COMBINED_BREAK_EVEN,
@@ -61,6 +62,7 @@ class StationFit:
     components: tuple[MatchResult, MatchResult] | None
     estimate: StationEstimate | None
     seconds: float
+    shape: StationShape | None = None
 
 
 def fit_joint(
@@ -112,8 +114,11 @@ def fit_joint(
     if method == "grcsm":
         noise = estimate_noise([fit.estimate for fit in fits if fit.estimate is not None], config.sensor)
         fits = _with_noise(fits, noise, config)
+        if config.shape.freedoms:
+            fits, noise = _with_shape(fits, noise, config)
         fits = _with_company(fits, noise)
         fits, motion = _along_the_joint(fits, motion)
+        fits = [f if f.shape is None else _judged(f, f.shape) for f in fits]
     else:
         motion = "independent"
     stations = tuple(_station_result(joint, fit) for fit in fits)
@@ -228,6 +233,19 @@ def _differs(found: SensorConfig, assumed: SensorConfig) -> bool:
     )
 
 
+def _with_shape(fits: list[StationFit], noise: Noise, config: Config) -> tuple[list[StationFit], Noise]:
+    """Free the components' shapes, and estimate again with them."""
+    sensor = noise.sensor if config.sensor.adapt else config.sensor
+    fits = free_shapes(fits, sensor, config)
+    fits = [dataclasses.replace(fit, estimate=_estimate(fit, sensor, config)) for fit in fits]
+    noise = estimate_noise([fit.estimate for fit in fits if fit.estimate is not None], sensor)
+    return _with_noise(fits, noise, config), noise
+
+
+def _judged(fit: StationFit, shape: StationShape) -> StationFit:
+    return fit if fit.estimate is None else dataclasses.replace(fit, estimate=judged(fit.estimate, shape))
+
+
 def _with_company(fits: list[StationFit], noise: Noise) -> list[StationFit]:
     """Flag what only the joint as a whole can tell: a bend, another shape, a fit amid misfits."""
     estimates = [fit.estimate for fit in fits if fit.estimate is not None]
@@ -263,8 +281,12 @@ def _station_result(joint: Joint, fit: StationFit) -> StationResult:
     known = status.measured and all(pose is not None for pose, _, _ in parts)
     matches = fit.components or (None, None)
     components = tuple(
-        ComponentResult(element, match, pose if known else None, cov if known else None, rms)
-        for element, match, (pose, cov, rms) in zip(joint.elements, matches, parts, strict=True)
+        ComponentResult(
+            element, match, pose if known else None, cov if known else None, rms, freedoms(fit.shape, which)
+        )
+        for which, (element, match, (pose, cov, rms)) in enumerate(
+            zip(joint.elements, matches, parts, strict=True)
+        )
     )
     a, b = components
     gap = None
@@ -272,6 +294,8 @@ def _station_result(joint: Joint, fit: StationFit) -> StationResult:
         gap = gap_section(
             fit.section.s, fit.section.frame, fit.section.gap, a.pose, b.pose, a.covariance, b.covariance
         )
+        if fit.shape is not None and a.covariance is not None and b.covariance is not None:
+            gap = with_shape_sigma(gap, fit.shape, (a.pose, b.pose), (a.covariance, b.covariance))
     return StationResult(fit.section, fit.slice, status, fit.combined, (a, b), gap, fit.seconds)
 
 

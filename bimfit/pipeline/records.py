@@ -27,6 +27,29 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
+class FreedomResult:
+    """One freedom of a component's shape at one station.
+
+    Attributes
+    ----------
+    name : str
+        ``bevel-angle``, ``face-angle`` or ``thickness`` (:mod:`bimfit.geometry.shape`).
+    value, sigma : float or None
+        Difference from the design and its standard deviation, rad or m; None where the data do not show it.
+    state : str
+        ``estimated``, ``at its limit`` or ``unseen``.
+    pooled : str
+        ``constant`` or ``linear`` along the joint, or ``station``; empty where it is unseen.
+    """
+
+    name: str
+    value: float | None
+    sigma: float | None
+    state: str
+    pooled: str
+
+
+@dataclass(frozen=True)
 class ComponentResult:
     """One component at one station.
 
@@ -42,6 +65,8 @@ class ComponentResult:
         Of (u, v, theta) of that motion.
     rms : float
         Root mean square residual of its returns, m; NaN when not known.
+    shape : tuple of FreedomResult
+        The freedoms of its shape that were asked for.
     """
 
     element: str
@@ -49,6 +74,7 @@ class ComponentResult:
     pose: Pose2D | None
     covariance: Array | None
     rms: float = float("nan")
+    shape: tuple[FreedomResult, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 from bimfit import __version__
 from bimfit.gap.section import gap_section
 from bimfit.geometry.pose import Pose2D
-from bimfit.pipeline.records import ComponentResult, JointResult, StationResult, SurveyResult
+from bimfit.pipeline.records import ComponentResult, FreedomResult, JointResult, StationResult, SurveyResult
 
 if TYPE_CHECKING:
     from bimfit.bim.model import Model
@@ -110,6 +110,18 @@ def _component(component: ComponentResult, frame: SectionFrame) -> dict[str, Any
         "covariance": component.covariance,
         "residual": component.rms,
         "search": None if component.match is None else _search(component.match, frame),
+        **({"shape": {f.name: _freedom(f) for f in component.shape}} if component.shape else {}),
+    }
+
+
+def _freedom(freedom: FreedomResult) -> dict[str, Any]:
+    """One freedom of shape: its difference from the design, null where the data do not show it."""
+    return {
+        "value": freedom.value,
+        "sigma": freedom.sigma,
+        "unit": "m" if freedom.name == "thickness" else "rad",
+        "state": freedom.state,
+        "pooled": freedom.pooled,
     }
 
 
@@ -231,13 +243,35 @@ COLUMNS = [
 def stations_to_csv(joints: Iterable[JointResult]) -> str:
     """One row a station, for a spreadsheet; what is not known is left empty."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    joints = tuple(joints)
+    writer = csv.DictWriter(text, [*COLUMNS, *_shape_columns(joints)], lineterminator="\n")
     writer.writeheader()
     for joint in joints:
         for station in joint.stations:
             row = {key: value for key, value in _row(joint, station).items() if not _unknown(value)}
             writer.writerow({key: repr(float(v)) if isinstance(v, float) else v for key, v in row.items()})
     return text.getvalue()
+
+
+def _shape_columns(joints: Iterable[JointResult]) -> list[str]:
+    """Columns of the shape freedoms that any station has, in order."""
+    found = [
+        column
+        for joint in joints
+        for station in joint.stations
+        for name, component in zip("ab", station.components, strict=True)
+        for column in _shape_row(name, component)
+    ]
+    return sorted(set(found), key=found.index)
+
+
+def _shape_row(name: str, component: ComponentResult) -> dict[str, float | None]:
+    row: dict[str, float | None] = {}
+    for freedom in component.shape:
+        what = f"{name}_{freedom.name.replace('-', '_')}"
+        unit = "m" if freedom.name == "thickness" else "rad"
+        row |= {f"{what}_{unit}": freedom.value, f"sigma_{what}_{unit}": freedom.sigma}
+    return row
 
 
 def _unknown(value: Any) -> bool:
@@ -257,6 +291,7 @@ def _row(joint: JointResult, station: StationResult) -> dict[str, Any]:
         "points": len(station.slice.points),
     }
     for name, component in zip("ab", station.components, strict=True):
+        row |= _shape_row(name, component)
         if component.pose is not None:
             row |= {
                 f"{name}_u_m": component.pose.u,
