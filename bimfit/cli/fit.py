@@ -69,6 +69,7 @@ def run(
     bcf_version: str = typer.Option("2.1", "--bcf-version", metavar="V", help="2.1 or 3.0."),
 ) -> int:
     """Fit the joints of a model to a scan and write the as-built gap."""
+    from bimfit.pipeline.aligning import describe_alignment
     from bimfit.pipeline.deliver import Deliverables, check_deliverables, deliver
     from bimfit.pipeline.limits import Limits
     from bimfit.pipeline.output import check_folder, describe
@@ -107,6 +108,8 @@ def run(
             progress=progress,
         )
         _, said = deliver(result, output, wanted, progress)
+    if result.placed is not None and result.placed.alignment is not None:
+        print(describe_alignment(result.placed.alignment))
     for one in result.joints:
         print(describe(one))
     print(f"results in {output}")

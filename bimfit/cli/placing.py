@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from bimfit.cli.options import read_pose
+from bimfit.cli.options import angle, length, read_pose
 from bimfit.cli.reading import READING, read_options
 from bimfit.cli.sharing import shared_options
 from bimfit.errors import ConfigError
 
 if TYPE_CHECKING:
     from bimfit.pipeline.placing import Placing
+    from bimfit.registration.alignment import AlignConfig
 
 _OPTIONS: dict[str, tuple[Any, Any]] = {
     "scan_pose": (
@@ -43,6 +44,21 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {
         ),
     ),
     **READING,
+    "align": (
+        bool,
+        typer.Option(
+            False, "--align", help="Move the scan to where it fits the joint's surroundings best, proven."
+        ),
+    ),
+    "align_window": (
+        str | None,
+        typer.Option(
+            None,
+            "--align-window",
+            metavar="SHIFT,ANGLE",
+            help="How far it may be off, such as 50mm,3deg; means --align.",
+        ),
+    ),
 }
 
 
@@ -51,7 +67,15 @@ def placing(command: Callable[..., int]) -> Callable[..., int]:
     return shared_options(command, "where", _OPTIONS, _placing)
 
 
-def _placing(*, scan_pose: str | None, trajectory: Path | None, scan_crs: str, **how: Any) -> Placing:
+def _placing(
+    *,
+    scan_pose: str | None,
+    trajectory: Path | None,
+    scan_crs: str,
+    align: bool,
+    align_window: str | None,
+    **how: Any,
+) -> Placing:
     from bimfit.pipeline.placing import CRS, Placing
     from bimfit.scan.trajectory import read_tum
 
@@ -62,4 +86,16 @@ def _placing(*, scan_pose: str | None, trajectory: Path | None, scan_crs: str, *
         trajectory=None if trajectory is None else read_tum(trajectory),
         crs=scan_crs,
         options=read_options(**how),
+        align=_align(align, align_window),
     )
+
+
+def _align(align: bool, window: str | None) -> AlignConfig | None:
+    from bimfit.registration.alignment import AlignConfig
+
+    if window is None:
+        return AlignConfig() if align else None
+    shift, _, turn = window.partition(",")
+    if not turn:
+        raise ConfigError(f"--align-window {window}: wants two values", remedy="such as 50mm,3deg")
+    return AlignConfig(length(shift, "--align-window"), angle(turn, "--align-window"))

@@ -20,7 +20,7 @@ from bimfit.geometry.pose import Array
 from bimfit.geometry.slice import Slice
 from bimfit.pipeline.accuracy import joint_errors
 from bimfit.pipeline.fit import METHODS, check_choice, fit_joint
-from bimfit.pipeline.placing import Placing, place_scan
+from bimfit.pipeline.placing import Placing
 from bimfit.pipeline.records import JointResult
 from bimfit.pipeline.results import to_json
 from bimfit.report.tables import MethodOutcome, plot_comparison
@@ -116,7 +116,7 @@ def compare(
         For an input that cannot be used, or a method that does not exist.
     """
     from bimfit.bim.selection import Selection
-    from bimfit.pipeline.survey import covered_joints, cut_joint, model_joints, part_of
+    from bimfit.pipeline.survey import cut_joint, model_joints, part_of, shown_joints
 
     check_methods(methods)
     truths = read_truth(truth) if truth is not None else ()
@@ -124,11 +124,8 @@ def compare(
     if truths and not wanted.named:
         wanted = dataclasses.replace(wanted, names=tuple(",".join(one.elements) for one in truths))
     model, found = model_joints(model_path, config.joints, wanted)
-    scan = place_scan(scan_path, model, found, config, placing or Placing(scan_pose)).nearby
-    cuts = [
-        cut_joint(model, joint, part_of(scan, joint, config), config)
-        for joint in covered_joints(found, scan, config, asked=wanted.named)
-    ]
+    placed, shown = shown_joints(scan_path, model, found, config, placing or Placing(scan_pose), wanted.named)
+    cuts = [cut_joint(model, joint, part_of(placed.nearby, joint, config), config) for joint in shown]
     cuts = [cut for cut in cuts if cut[1]]
     if not cuts:
         raise ScanError(

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from bimfit.scan.trajectory import Trajectory
 if TYPE_CHECKING:
     from bimfit.bim.joint import Joint
     from bimfit.bim.model import Model
+    from bimfit.registration.alignment import AlignConfig, Alignment
 
 Scan = LineScan | PointCloud
 Crs = Literal["auto", "project", "map"]
@@ -52,12 +53,15 @@ class Placing:
         Which of the two; auto looks in which one the scan shows joints.
     options : ReadOptions
         How to read the file.
+    align : AlignConfig or None
+        How far the scan may still be off; None takes it to be in place.
     """
 
     pose: Array | None = None
     trajectory: Trajectory | None = None
     crs: Crs = "auto"
     options: ReadOptions = ANY
+    align: AlignConfig | None = None
 
 
 @dataclass(frozen=True)
@@ -73,16 +77,15 @@ class Placed:
         What carried the file's coordinates (m), or those of the trajectory's frame, to the model's: a rigid
         motion times the map's scale.
     notes : tuple of str
+    alignment : Alignment or None
+        What the scan was then moved by, where that was asked for; ``T_world_file`` includes it.
     """
 
     nearby: Nearby
     crs: str
     T_world_file: Array
     notes: tuple[str, ...] = ()
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for results.json."""
-        return {"crs": self.crs, "transform": self.T_world_file.ravel()}
+    alignment: Alignment | None = None
 
 
 def joint_boxes(joint: Joint, config: Config, margin: float = 0.0) -> Boxes:
@@ -110,8 +113,15 @@ def path_boxes(path: JointPath, reach: float) -> Boxes:
     return Boxes.of(np.concatenate(boxes)).grown(reach)
 
 
-def place_scan(path: Path, model: Model, joints: Sequence[Joint], config: Config, placing: Placing) -> Placed:
-    """Read a scan once, a piece at a time, and keep what lies near the joints.
+def place_scan(
+    path: Path,
+    model: Model,
+    joints: Sequence[Joint],
+    config: Config,
+    placing: Placing,
+    margin: float = 0.0,
+) -> Placed:
+    """Read a scan once, a piece at a time, and keep what lies near the joints, or ``margin`` (m) farther.
 
     Raises
     ------
@@ -119,7 +129,7 @@ def place_scan(path: Path, model: Model, joints: Sequence[Joint], config: Config
         When it cannot be read, or nothing of it lies near a joint: then with what would help.
     """
     frames = _frames(model, placing)
-    places = Boxes.of(np.concatenate([joint_boxes(joint, config).array for joint in joints]))
+    places = Boxes.of(np.concatenate([joint_boxes(joint, config, margin).array for joint in joints]))
     still = np.eye(4) if placing.pose is None or placing.trajectory is not None else placing.pose
     moves = {name: T @ still for name, T in frames.items()}
     gatherers = {name: Gatherer(places) for name in moves}

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.pose import Array, Pose2D
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from bimfit.gap.step import Step
     from bimfit.gap.volume import Volumes
     from bimfit.geometry.line_scan import LineScan
+    from bimfit.pipeline.placing import Placed
     from bimfit.registration.result import MatchResult
     from bimfit.scan.cloud import PointCloud
 
@@ -165,8 +166,8 @@ class SurveyResult:
     joints : tuple of JointResult
     notes : tuple of str
         What a user should know of how the files were read.
-    placing : mapping
-        How the scan was carried to the model's coordinates, in plain values.
+    placed : Placed or None
+        How the scan was carried to the model's coordinates.
     """
 
     model: Path
@@ -176,7 +177,7 @@ class SurveyResult:
     config: Config
     joints: tuple[JointResult, ...]
     notes: tuple[str, ...] = ()
-    placing: Mapping[str, Any] = field(default_factory=dict)
+    placed: Placed | None = None
 
     @property
     def failed(self) -> Sequence[JointResult]:

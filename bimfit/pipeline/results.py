@@ -47,9 +47,24 @@ def survey_to_dict(
         "scan": str(survey.scan),
         "units": {"length": "m", "angle": "rad"},
         "notes": list(survey.notes),
-        "placing": dict(survey.placing),
+        "placing": _placing(survey),
         "limits": dict(limits) if limits else None,
         "joints": [_joint(joint, survey.building, meshes.get(joint.joint.id, {})) for joint in survey.joints],
+    }
+
+
+def _placing(survey: SurveyResult) -> dict[str, Any] | None:
+    """How the scan's file became world coordinates."""
+    from bimfit.pipeline.aligning import alignment_to_dict
+
+    placed = survey.placed
+    if placed is None:
+        return None
+    found = placed.alignment
+    return {
+        "crs": placed.crs,
+        "transform": placed.T_world_file.ravel(),
+        "align": None if found is None else alignment_to_dict(found),
     }
 
 

@@ -20,7 +20,7 @@ from bimfit.geometry.pose import Array
 from bimfit.geometry.slice import Slice
 from bimfit.pipeline.fit import check_choice, fit_joint
 from bimfit.pipeline.listing import model_joints as model_joints
-from bimfit.pipeline.placing import NEAR, Placing, joint_boxes, place_scan
+from bimfit.pipeline.placing import NEAR, Placed, Placing, joint_boxes, place_scan
 from bimfit.pipeline.records import JointResult, SurveyResult
 from bimfit.pipeline.shown import share_shown
 from bimfit.pipeline.targets import match_reach, with_assumed_view, with_recovered_view
@@ -31,6 +31,7 @@ from bimfit.scan.slicing import cut_slices
 
 if TYPE_CHECKING:
     from bimfit.bim.joint import Joint
+    from bimfit.bim.model import Model
     from bimfit.bim.selection import Selection
 
 Scan = LineScan | PointCloud
@@ -88,15 +89,7 @@ def survey(
     model, found = model_joints(model_path, config.joints, joints)
     progress("reading the scan", 0.0)
     asked = by_name(joints)
-    placed = place_scan(scan_path, model, found, config, placing or Placing(scan_pose))
-    chosen = covered_joints(found, placed.nearby, config, asked=asked)
-    if not chosen:
-        one = "the joint that was asked for" if asked else "enough of any joint"
-        raise ScanError(
-            f"the scan does not show {one}",
-            file=scan_path,
-            remedy="check its units and its frame; --scan-pose places a scan that is in scanner coordinates",
-        )
+    placed, chosen = shown_joints(scan_path, model, found, config, placing or Placing(scan_pose), asked)
     results: list[JointResult] = []
     progress("cutting the joints", 0.0)
     cuts = [cut_joint(model, joint, part_of(placed.nearby, joint, config), config) for joint in chosen]
@@ -117,8 +110,40 @@ def survey(
     said = (*model.notes, *model.left_out(most=3), *placed.notes)
     notes = (*said, *([partly] if partly else []))
     return SurveyResult(
-        model_path, scan_path, model, placed.nearby.scan, config, tuple(results), notes, placed.to_dict()
+        model_path, scan_path, model, placed.nearby.scan, config, tuple(results), notes, placed
     )
+
+
+def shown_joints(
+    path: Path, model: Model, joints: Sequence[Joint], config: Config, placing: Placing, asked: bool
+) -> tuple[Placed, list[Joint]]:
+    """A scan in its place, aligned where that is wanted, and the joints that it shows.
+
+    Raises
+    ------
+    ScanError
+        When it shows none, or cannot be aligned safely.
+    """
+    margin = 0.0
+    if placing.align is not None:
+        from bimfit.pipeline.aligning import aligned, reach_of
+
+        margin = (
+            reach_of(placing.align, joints) if asked else max(reach_of(placing.align, [j]) for j in joints)
+        )
+    placed = place_scan(path, model, joints, config, placing, margin)
+    chosen = covered_joints(joints, placed.nearby, config, asked=asked, margin=margin)
+    if chosen and placing.align is not None:
+        placed = aligned(placed, model, chosen, config, placing.align)
+        chosen = covered_joints(chosen, placed.nearby, config, asked=asked)
+    if not chosen:
+        one = "the joint that was asked for" if asked else "enough of any joint"
+        raise ScanError(
+            f"the scan does not show {one}",
+            file=path,
+            remedy="check its units and its frame; --scan-pose places a scan that is in scanner coordinates",
+        )
+    return placed, chosen
 
 
 def by_name(joints: Selection | Sequence[str]) -> bool:
@@ -141,21 +166,24 @@ def load_scan(path: Path, pose: Array | None = None) -> Scan:
 
 
 def covered_joints(
-    joints: Sequence[Joint], scan: Scan | Nearby, config: Config, *, asked: bool
+    joints: Sequence[Joint], scan: Scan | Nearby, config: Config, *, asked: bool, margin: float = 0.0
 ) -> list[Joint]:
-    """Joints that the scan shows: any of their length where they were asked for, else a good part of it."""
+    """Joints that the scan shows: any of their length where they were asked for, else a good part of it.
+
+    ``margin`` (m) is by how much the scan may still be off.
+    """
     least = 0.0 if asked else LEAST_COVER
     chosen = []
     for joint in joints:
-        part = part_of(scan, joint, config)
-        if max(covers(part, path, NEAR) for path in mouth_paths(joint)) > least:
+        part = part_of(scan, joint, config, margin)
+        if max(covers(part, path, NEAR + margin) for path in mouth_paths(joint)) > least:
             chosen.append(joint)
     return chosen
 
 
-def part_of(scan: Scan | Nearby, joint: Joint, config: Config) -> Scan:
+def part_of(scan: Scan | Nearby, joint: Joint, config: Config, margin: float = 0.0) -> Scan:
     """What of a scan matters to a joint."""
-    return scan.around(joint_boxes(joint, config)) if isinstance(scan, Nearby) else scan
+    return scan.around(joint_boxes(joint, config, margin)) if isinstance(scan, Nearby) else scan
 
 
 def fully_shown(cuts: Sequence[Cut], config: Config) -> tuple[list[Cut], str]:

@@ -31,6 +31,7 @@ from bimfit.registration.table_3d import Target3D
 _LEAST_SHARE = 0.1
 _GOOD_SHARE = 0.5
 _SCOUTING = 3000
+Flat = tuple[tuple[str, Array], ...]
 _NO_LOSS = 0.5
 """Scores that differ by less than this many points are as good."""
 
@@ -96,16 +97,16 @@ def match_3d(
     if not len(problem.points):
         status = Status("no_data", "there are no points to match")
         return MatchResult("grcsm-3d", np.full(6, np.nan), status=status)
-    conditional, at, score, spent, names = _prepare(problem, eps, limit, deadline)
+    conditional, at, score, spent, flat = _prepare(problem, eps, limit, deadline)
     outcome = Search3D(conditional, at, score, spent).run(eps, delta, limit, deadline)
     pose = _polished(problem, conditional, outcome)
     seconds = time.perf_counter() - begun
-    return _result(problem, conditional, outcome, pose, names, refine, seconds)
+    return _result(problem, conditional, outcome, pose, flat, refine, seconds)
 
 
 def _prepare(
     problem: Problem3D, eps: float, limit: float, deadline: float | None
-) -> tuple[Problem3D, Array, float, int, tuple[str, ...]]:
+) -> tuple[Problem3D, Array, float, int, Flat]:
     """An incumbent, and the search without what the data leave open there.
 
     A poor incumbent says nothing of what the data fix, so that the search itself betters it first.
@@ -114,13 +115,13 @@ def _prepare(
     if score < _GOOD_SHARE * problem.total and len(at):
         first = Search3D(problem, at, score, spent).run(eps, 0.0, min(limit, spent + _SCOUTING), deadline)
         at, score, spent = first.at, first.score, first.evaluations
-    flat, names = flat_directions(problem, problem.pose(at))
+    flat, named = flat_directions(problem, problem.pose(at))
     if not flat.shape[1]:
-        return problem, at, score, spent, names
+        return problem, at, score, spent, named
     at = _at_prior(problem, at, score, flat)
     conditional = without(problem, at, flat)
     score = problem.score(problem.pose(at))
-    return conditional, np.zeros(len(conditional.steps)), score, spent + 1, names
+    return conditional, np.zeros(len(conditional.steps)), score, spent + 1, named
 
 
 def _at_prior(problem: Problem3D, at: Array, score: float, flat: Array) -> Array:
@@ -147,7 +148,7 @@ def _result(
     conditional: Problem3D,
     outcome: Outcome3D,
     pose: Array,
-    names: tuple[str, ...],
+    flat: Flat,
     refine: bool,
     seconds: float,
 ) -> MatchResult:
@@ -170,12 +171,13 @@ def _result(
         bound=outcome.bound,
         evaluations=outcome.evaluations,
         stop=outcome.stop,
-        status=_status(conditional, outcome, names),
+        status=_status(conditional, outcome, tuple(name for name, _ in flat)),
         levels=tuple(int(np.ceil(np.log2(2.0 * r + 1.0))) for r in conditional.reach),
         fitness=float(np.mean(fitted.inlier)),
         inlier_rmse=fitted.rmse,
         modes=modes,
         seconds=seconds,
+        flat=flat,
     )
 
 

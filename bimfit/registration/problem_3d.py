@@ -185,7 +185,7 @@ def _motion(prior: ArrayLike | None) -> Array:
     return motion
 
 
-def flat_directions(problem: Problem3D, pose: Array) -> tuple[Array, tuple[str, ...]]:
+def flat_directions(problem: Problem3D, pose: Array) -> tuple[Array, tuple[tuple[str, Array], ...]]:
     """The searched directions that the score hardly depends on at a pose (6,).
 
     The score's curvature over half a blur is an effective number of points that fix a direction. A
@@ -196,7 +196,8 @@ def flat_directions(problem: Problem3D, pose: Array) -> tuple[Array, tuple[str, 
     -------
     flat : ndarray, shape (d, k)
         Orthonormal, in the searched axes with rotations scaled by the lever.
-    names : tuple of str
+    named : tuple of (str, ndarray, shape (6,))
+        Their names, and themselves in all six axes, of unit length.
     """
     d = len(problem.steps)
     scale = scales(problem)
@@ -226,7 +227,8 @@ def flat_directions(problem: Problem3D, pose: Array) -> tuple[Array, tuple[str, 
     # Far from a summit the score curves upwards too, but there it changes.
     still = [max(abs(score(h * v) - middle), abs(score(-h * v) - middle)) < 0.5 * limit for v in vectors.T]
     flat = vectors[:, (values * blur**2 < limit) & np.array(still, bool)]
-    return flat, tuple(direction_name(problem.V @ column) for column in flat.T)
+    each = [problem.V @ column for column in flat.T]
+    return flat, tuple((direction_name(v), v / np.linalg.norm(v)) for v in each)
 
 
 def scales(problem: Problem3D) -> Array:

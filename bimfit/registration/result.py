@@ -57,6 +57,9 @@ class MatchResult:
         Wall time of the search alone.
     quantisation : float
         Rounding table values and weights to integers changes no score by more than this.
+    flat : tuple of (str, ndarray)
+        Directions that the data leave open, by name and as a unit vector of the motion, rotations scaled to
+        lengths by the data's lever; the certificate holds for all others.
     """
 
     method: str
@@ -72,6 +75,7 @@ class MatchResult:
     modes: tuple[Mode, ...] = field(default_factory=tuple)
     seconds: float = 0.0
     quantisation: float = 0.0
+    flat: tuple[tuple[str, Array], ...] = ()
 
     @property
     def gap(self) -> float:

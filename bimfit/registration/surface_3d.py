@@ -115,6 +115,39 @@ def visible_surface(mesh: TriangleMesh, spacing: float, viewpoint: ArrayLike | N
     return surface.subset(seen, unsigned=viewpoint is None)
 
 
+def clipped(mesh: TriangleMesh, boxes: ArrayLike, size: float) -> TriangleMesh:
+    """The part of a mesh near boxes: triangles whose own box meets one, none much longer than ``size``.
+
+    Long triangles are halved again and again across their longest edge, and what lies far is dropped, so
+    that of a large element only the surroundings of the boxes are left.
+
+    Parameters
+    ----------
+    mesh : TriangleMesh
+    boxes : array_like, shape (k, 2, 3)
+    size : float
+        m.
+    """
+    low, high = np.moveaxis(np.asarray(boxes, float), 1, 0)
+    todo, done = np.asarray(mesh.triangles, float), []
+    while len(todo):
+        near = np.zeros(len(todo), bool)
+        least, most = todo.min(axis=1), todo.max(axis=1)
+        for a, b in zip(low, high, strict=True):
+            near |= ((least <= b) & (most >= a)).all(axis=1)
+        todo = todo[near]
+        sides = np.linalg.norm(todo - np.roll(todo, -1, axis=1), axis=2)
+        long = sides.max(axis=1, initial=0.0) > size
+        done.append(todo[~long])
+        todo, longest = todo[long], np.argmax(sides[long], axis=1)
+        rows = np.arange(len(todo))
+        a, b, c = (todo[rows, (longest + k) % 3] for k in range(3))
+        middle = 0.5 * (a + b)
+        todo = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+    kept = np.concatenate(done) if done else np.zeros((0, 3, 3))
+    return TriangleMesh.of(kept.reshape(-1, 3), np.arange(3 * len(kept)).reshape(-1, 3))
+
+
 class Caster:
     """Casts rays at a mesh (Open3D, Embree), in double precision coordinates however large.
 

@@ -166,6 +166,11 @@ class Target3D:
         return int(self.field.nbytes + self.tables.bricks.nbytes + self.tables.records.nbytes)
 
 
+def affordable_spacing(surface: Surface, blur: float, max_bytes: int = 128 * 2**20) -> float:
+    """The lattice's spacing (m) that :meth:`Target3D.of` takes for samples of a surface by itself."""
+    return _affordable(_corners(surface), _area(surface, None), blur, max_bytes)
+
+
 def _corners(shape: TriangleMesh | Surface | ArrayLike) -> Array:
     if isinstance(shape, TriangleMesh):
         if not len(shape.faces):

@@ -208,3 +208,39 @@ def test_a_moving_sensor_is_placed_by_each_beams_own_time(tmp_path, scene) -> No
     write_scan(PointCloud(scan.hits), tmp_path / "cloud.ply")
     with pytest.raises(ScanError, match="cloud of points"):
         cuts(tmp_path / "cloud.ply", scene, Placing(trajectory=way))
+
+
+def test_a_scan_off_by_centimetres_and_degrees_is_aligned(tmp_path) -> None:
+    """Its slices lie then where those of the scan in place lie, and the results say how that was proven."""
+    import math
+
+    from bimfit.pipeline.aligning import alignment_to_dict, describe_alignment
+    from bimfit.pipeline.survey import shown_joints
+    from bimfit.registration.alignment import AlignConfig
+    from bimfit.registration.rigid_3d import about
+
+    path = SAMPLES / "t-joint.ifc"
+    model, joints = model_joints(path, Config().joints)
+    still = Scenario(motion="none", spacing=0.02)
+    scan, _ = simulate(path, still, 3)
+    off = about(scan.bounds.mean(axis=0), [0.03, -0.02, 0.035], np.radians([1.5, -2.0, 1.0]))
+    write_scan(scan.transformed(off), tmp_path / "off.npz")
+    align = AlignConfig(blur=0.012, points=400)
+    placed, chosen = shown_joints(
+        tmp_path / "off.npz", model, joints, CONFIG, Placing(align=align), asked=False
+    )
+    (joint,) = chosen
+    found = placed.alignment
+    hits = placed.nearby.scan.hits
+    along = joint.path.leg_directions[0]
+    across = (hits - scan.hits) - ((hits - scan.hits) @ along)[:, None] * along
+    assert np.sqrt(np.mean(np.sum(across**2, axis=1))) < 0.003
+    np.testing.assert_allclose(placed.T_world_file, found.T_model_scan)
+    plain = alignment_to_dict(found)
+    assert plain["stop"] in ("proven", "tolerance")
+    assert plain["bound"] >= plain["score"] > 0.7 * plain["points"]
+    assert plain["window"] == {"shift": 0.05, "turn": math.radians(3.0)}
+    line = describe_alignment(found)
+    assert "gap" in line
+    assert "bound" in line
+    assert cut_joint(model, joint, part_of(placed.nearby, joint, CONFIG), CONFIG)[2]
