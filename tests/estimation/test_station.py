@@ -132,15 +132,15 @@ def test_a_singular_matrix_is_a_rejection(monkeypatch):
 
 
 def test_a_coarse_fan_is_uncertain_by_its_cell_and_not_ambiguous():
-    """Beams 6.5 mm apart: the edge lies between two, which is one place, sd at most 6.5 / sqrt(12) mm."""
-    sec, rng = S.butt(gap=0.030, depth=0.1), np.random.default_rng(5)
-    step = np.radians(0.25)
+    """Beams 10 mm apart: the edge lies between two, which is one place, sd at most 10 / sqrt(12) mm."""
+    sec, rng = S.butt(gap=0.050, depth=0.03), np.random.default_rng(5)
+    step = np.radians(0.4)
     cell, widest, names = 1.5 * step, 0.0, []
     for _ in range(12):
         shift = rng.uniform(-0.3, 0.3) * cell
         pose = Pose2D(shift, 0.002, 0.0)
         slice_ = S.scan(
-            rng, [p.moved(pose) for p in sec.components], eye=(0.0, 1.5), half=70, step=step, sigma=0.002
+            rng, [p.moved(pose) for p in sec.components], eye=(0.0, 1.5), half=45, step=step, sigma=0.002
         )
         result = estimate_station(sec, slice_, pose, SensorConfig(sigma=0.002), FitConfig())
         assert result.status.name != "ambiguous", result.status
@@ -150,5 +150,5 @@ def test_a_coarse_fan_is_uncertain_by_its_cell_and_not_ambiguous():
             assert abs(c.pose.u - shift) < min(cell, 4.0 * sd)
             assert sd < 1.6 * cell / np.sqrt(12)
             widest = max(widest, sd)
-    assert widest > 0.8 * cell / np.sqrt(12)
+    assert widest > 0.5 * cell / np.sqrt(12)
     assert names.count("ok") >= 11
