@@ -18,6 +18,7 @@ from bimfit.files import protect_inputs, whole_file
 from bimfit.geometry.mesh import TriangleMesh
 from bimfit.geometry.pose import Array
 
+GAP_CLASS, GAP_TYPE = "IfcVirtualElement", "AsBuiltGap"
 GAP_SET = "BimfitPset_AsBuiltGap"
 GAP_QUANTITIES = "BimfitQto_AsBuiltGap"
 DEVIATION_SET = "BimfitPset_AsBuiltDeviation"
@@ -37,6 +38,8 @@ class AsBuiltGap:
         The verdict, and why where it is not ``ok``.
     designed_width : float
         m.
+    contact : str
+        How close the components come: ``clear``, ``touch`` or ``clash``; empty where not known.
     width_min, width_mean, width_max, width_sigma : float or None
         Width of the mouth along the joint and the standard deviation of its estimate, m; negative where the
         components overlap.
@@ -68,6 +71,7 @@ class AsBuiltGap:
     volume_sigma: float | None = None
     stations: int = 0
     measured: int = 0
+    contact: str = ""
     mesh: TriangleMesh | None = None
 
 
@@ -159,10 +163,10 @@ def _add_gap(writer: IfcWriter, gap: AsBuiltGap, path: Path) -> None:
     components = [_element(writer, guid, path) for guid in gap.elements]
     container = writer.container(components[0]) or writer.container(components[1])
     element = writer.root(
-        "IfcVirtualElement",
+        GAP_CLASS,
         f"as-built gap {gap.id}",
         Description=" / ".join(part.Name or part.GlobalId for part in components),
-        ObjectType="AsBuiltGap",
+        ObjectType=GAP_TYPE,
     )
     if gap.mesh is not None and len(gap.mesh.faces):
         writer.give_mesh(element, gap.mesh, container)
@@ -181,6 +185,7 @@ def _add_gap(writer: IfcWriter, gap: AsBuiltGap, path: Path) -> None:
         "Kind": ("IfcLabel", gap.kind),
         "Status": ("IfcLabel", gap.status),
         "Reason": ("IfcText", gap.reason or None),
+        "Contact": ("IfcLabel", gap.contact or None),
         "DesignedWidth": ("IfcLengthMeasure", length(gap.designed_width)),
         "WidthMin": ("IfcLengthMeasure", length(gap.width_min)),
         "WidthMean": ("IfcLengthMeasure", length(gap.width_mean)),

@@ -39,7 +39,7 @@ def run(
     from bimfit.simulation.scenario import Scenario, load_scenario
     from bimfit.simulation.truth import write_truth
 
-    inputs = [path for path in (model, scenario) if path is not None]
+    inputs = [path for path in (model, scenario, choice.pairs) if path is not None]
     protect_inputs([path for path in (output, truth) if path is not None], inputs)
     settings = load_scenario(scenario) if scenario else Scenario()
     scan, truths = simulate(model, settings, seed, joints=choice, told=_note)

@@ -11,7 +11,7 @@ import numpy as np
 from bimfit.bim.as_built import AsBuiltGap, MovedElement, write_as_built
 from bimfit.errors import BimfitError
 from bimfit.estimation.element_motion import Seen, element_motion
-from bimfit.pipeline.document import TRUSTED
+from bimfit.pipeline.document import TRUSTED, closest
 from bimfit.pipeline.records import JointResult, SurveyResult
 
 NAME = "as-built.ifc"
@@ -93,6 +93,7 @@ def as_built_gap(result: JointResult) -> AsBuiltGap:
         reason=""
         if not flagged
         else f"{flagged} of {len(result.stations)} stations are not ok; see results.json",
+        contact=closest({gap.contact for gap in gaps}),
         width_min=float(widths.min()),
         width_mean=float(widths.mean()),
         width_max=float(widths.max()),

@@ -36,6 +36,7 @@ SUITES = {
     "scan": "bimfit.pipeline.bench_scan:bench_scan",
     "bim": "bimfit.pipeline.bench_bim:bench_bim",
     "fuzz": "bimfit.pipeline.bench_fuzz:bench_fuzz",
+    "back": "bimfit.pipeline.bench_back:bench_back",
     "refusal": "bimfit.pipeline.bench_refusal:bench_refusal",
 }
 """Each suite's function of (joints, seed, progress), which returns a Bench or its (text, data)."""

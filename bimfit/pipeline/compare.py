@@ -132,7 +132,7 @@ def compare(
             "the scan shows none of the joints", file=scan_path, remedy="check its units and frame"
         )
     results = run_methods(cuts, config, methods, truths, progress)
-    inputs = tuple(path for path in (model_path, scan_path, truth) if path is not None)
+    inputs = tuple(path for path in (model_path, scan_path, truth, wanted.pairs) if path is not None)
     return Comparison(results, "truth" if truths else methods[0], inputs)
 
 

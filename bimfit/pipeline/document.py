@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -124,6 +124,11 @@ class JointDocument:
         return {name: names.count(name) for name in order if name in names}
 
     @property
+    def contact(self) -> str:
+        """The closest that the two components come as built, see :func:`closest`."""
+        return closest({station.contact for station in self.trusted})
+
+    @property
     def storey(self) -> str:
         """The storey of both elements, or both of them."""
         return " / ".join(dict.fromkeys(name for name in self.storeys if name))
@@ -150,6 +155,12 @@ class ResultsDocument:
     notes: tuple[str, ...]
     joints: tuple[JointDocument, ...]
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+
+def closest(contacts: Collection[str]) -> str:
+    """The closest that two components come: ``clash`` (they overlap), ``touch``, ``clear``, or nothing."""
+    names = {"overlap": "clash", "touch": "touch", "clearance": "clear"}
+    return next((names[name] for name in names if name in contacts), "")
 
 
 def read_results(folder: Path) -> ResultsDocument:

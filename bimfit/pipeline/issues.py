@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import tempfile
 from collections.abc import Callable, Mapping
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 _NEAREST, _FARTHEST = 0.6, 6.0
 _SLANT = math.radians(25.0)
 _NEEDLE = 0.12
+_MARGIN, _LEAST_MARGIN = 0.25, 0.15
+"""How much around a joint its picture shows, of its length, and at least, m."""
 _VIEW = View(azimuth=62.0, elevation=48.0, opacity=0.35, size=(1400, 640))
 Progress = Callable[[str, float], None]
 
@@ -185,17 +188,25 @@ def _snapshot(
 ) -> bytes | None:
     """The joint in space, and its figures along it against the limits."""
     with tempfile.TemporaryDirectory(prefix="bimfit-") as place:
-        view = draw_joint(Path(place) / "view.png", joint, verdict, folder, building)
-        series = limit_series(joint, limits)
-        if view is None and not series:
-            return None
-        picture = Path(place) / "snapshot.png"
-        plot_limits(picture, series, picture=view, title=_headline(joint, verdict))
+        series = limit_series(joint, limits) if joint.trusted else []
+        title = _headline(joint, verdict)
+        view = draw_joint(
+            Path(place) / "view.png", joint, verdict, folder, building, title="" if series else title
+        )
+        if not series:
+            return None if view is None else view.read_bytes()
+        picture = plot_limits(Path(place) / "snapshot.png", series, picture=view, title=title)
         return picture.read_bytes()
 
 
 def draw_joint(
-    path: Path, joint: JointDocument, verdict: Verdict, folder: Path, building: Model | None
+    path: Path,
+    joint: JointDocument,
+    verdict: Verdict,
+    folder: Path,
+    building: Model | None,
+    *,
+    title: str = "",
 ) -> Path | None:
     """Draw a joint in space, its worst station marked; None where neither elements nor gap are known."""
     elements, gap = joint_elements(joint, building), load_gap(joint, folder)
@@ -210,8 +221,14 @@ def draw_joint(
         marked=([needle] if verdict.breaches else []) + ([joint.path] if gap is None else []),
         up=outward,
         along=along,
+        title=title,
     )
-    return render_joint(path, scene, _VIEW)
+    line = joint.path if len(joint.path) else target[None]
+    # of a joint that was not measured, what it is a part of says more
+    margin = max((_MARGIN if joint.trusted else 1.0) * joint.length, _LEAST_MARGIN)
+    box = margin * np.array([*np.eye(3), *-np.eye(3)])
+    around = (line[:, None, :] + box).reshape(-1, 3)
+    return render_joint(path, scene, dataclasses.replace(_VIEW, around=around))
 
 
 def limit_series(joint: JointDocument, limits: Limits) -> list[LimitSeries]:

@@ -17,7 +17,6 @@ from bimfit.pipeline.gap_files import load_gap
 from bimfit.pipeline.issues import joint_elements, limit_series
 from bimfit.pipeline.limits import SURE, Limits, Verdict, judge
 from bimfit.pipeline.output import PICTURES, safe_name
-from bimfit.pipeline.schedule import contact
 from bimfit.report.html import (
     Cell,
     Heading,
@@ -214,7 +213,7 @@ def _figures(joint: JointDocument) -> list[tuple[str, str]]:
         ("width from … to", f"{_text(low)} … {_text(high)} mm"),
         ("narrowest", f"{_text(1e3 * narrowest)} mm"),
         ("largest step", f"{_text(_step(joint))} mm"),
-        ("contact as built", touching.get(contact(joint), _NONE)),
+        ("contact as built", touching.get(joint.contact, _NONE)),
         ("length", f"{1e3 * joint.length:.0f} mm"),
         ("gap volume", f"{volume} litre"),
         ("motion along the joint", joint.motion or _NONE),

@@ -95,17 +95,10 @@ def _row(joint: JointDocument, verdict: Verdict) -> list[str | float | int | Non
         _known(1e3 * joint.volume_sigma),
         len(joint.stations),
         len(trusted),
-        contact(joint) or None,
+        joint.contact or None,
         remark(joint, verdict) or None,
         *joint.elements,
     ]
-
-
-def contact(joint: JointDocument) -> str:
-    """The closest that the two components come as built: overlap is called a clash."""
-    found = {station.contact for station in joint.trusted}
-    names = {"overlap": "clash", "touch": "touch", "clearance": "clear"}
-    return next((names[name] for name in names if name in found), "")
 
 
 def remark(joint: JointDocument, verdict: Verdict) -> str:

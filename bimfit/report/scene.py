@@ -79,6 +79,8 @@ class View:
         Pixels.
     sensor : bool
         Whether the sensor's path is drawn, and the picture made wide enough for it.
+    around : ndarray, shape (n, 3), or None
+        World points that fill the picture instead of ``focus``; what lies farther out is cut off by its rim.
     """
 
     focus: Literal["joint", "gap"] = "joint"
@@ -87,6 +89,7 @@ class View:
     elevation: float = 32.0
     size: tuple[int, int] = (1600, 1000)
     sensor: bool = False
+    around: Array | None = None
 
 
 _DEFAULT = View()
@@ -312,7 +315,7 @@ def _aim(plotter: Any, scene: JointScene, view: View, origin: Array) -> None:
     shown = shown or [p for p in (scene.points, *scene.outlines, *scene.marked) if p is not None and len(p)]
     if view.sensor and scene.sensor is not None:
         shown = [*shown, scene.sensor]
-    points = np.concatenate(shown) - origin
+    points = (np.concatenate(shown) if view.around is None else view.around) - origin
     right = np.cross(up, toward)
     right /= np.linalg.norm(right)
     upward = np.cross(toward, right)
