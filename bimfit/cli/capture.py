@@ -54,7 +54,16 @@ def run(
             def told(count: int) -> None:
                 progress(f"{count} sweeps", min(count / last, 1.0) if last else 0.0)
 
-            made = record(port, sweeps=sweeps, seconds=seconds, field=half, speed=way, pose=start, told=told)
+            made = record(
+                port,
+                sweeps=sweeps,
+                seconds=seconds,
+                field=half,
+                speed=way,
+                pose=start,
+                told=told,
+                note=lambda text: print(f"bimfit: note: {text}", file=sys.stderr, flush=True),
+            )
         with undisturbed():
             write_scan(made.scan, output)
     lost = f", {made.counters.missing} turns missing" if made.counters.missing else ""

@@ -84,9 +84,7 @@ def run(
             stream = (
                 live.replay(replay)
                 if replay is not None
-                else live.stream(
-                    port, field=half, sweeps=sweeps, told=lambda: _note(f"joint {live.joint.id}: go")
-                )
+                else live.stream(port, field=half, sweeps=sweeps, told=_note)
             )
             with closing(stream):  # type: ignore[type-var]
                 _follow(stream, as_json, sweeps, found)
@@ -108,12 +106,12 @@ def _follow(
 
 
 def _note(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+    print(f"bimfit: note: {text}", file=sys.stderr, flush=True)
 
 
 def _line(station: LiveStation) -> str:
     where = f"{station.index:5d} {_mm(station.s, 8)}"
-    verdict = f"{station.status.name}: {station.status.reason}" if station.status.reason else "ok"
+    verdict = ": ".join(part for part in (station.status.name, station.status.reason) if part)
     gap = station.gap
     if gap is None:
         return f"{where} {'-':>8} {'-':>5} {'-':>7} {'-':>7} {'-':>6}  {verdict}"
@@ -163,5 +161,6 @@ def _conclude(live: Live, found: list[LiveStation], stopped: bool) -> int:
     _note("; ".join([text, *(f"{count} {what}" for what, count in lost.items() if count)]))
     if measured or stopped:
         return 0
-    _note(f"bimfit: joint {live.joint.id} could not be estimated: {found[-1].status.reason}")
+    reason = found[-1].status.reason
+    print(f"bimfit: joint {live.joint.id} could not be estimated: {reason}", file=sys.stderr)
     return 1

@@ -54,6 +54,7 @@ def record(
     speed: float = 0.0,
     pose: Array | None = None,
     told: Callable[[int], None] = lambda count: None,
+    note: Callable[[str], None] = lambda text: None,
 ) -> Recording:
     """Record sweeps; the laser is off afterwards, whatever happens.
 
@@ -71,6 +72,8 @@ def record(
         T_world_sensor when the first sweep looks ahead; the sensor's own coordinates by default.
     told : callable
         Told the number of sweeps so far.
+    note : callable
+        Told, in a line, of what goes wrong meanwhile.
 
     Raises
     ------
@@ -79,7 +82,7 @@ def record(
     """
     kept: list[Sweep] = []
     interrupted, failure = False, None
-    device = Hokuyo(port, guard=True)
+    device = Hokuyo(port, guard=True, told=note)
     try:
         with device:
             start, end = (None, None) if field is None else device.parameters.steps(-field, field)

@@ -112,7 +112,7 @@ class Live:
             yield station
 
     def stream(
-        self, port: str | None, *, field: float, sweeps: int | None = None, told: Callable[[], None]
+        self, port: str | None, *, field: float, sweeps: int | None = None, told: Callable[[str], None]
     ) -> Iterator[LiveStation]:
         """Fit a sensor's sweeps as they come, until the joint's end; the laser is off afterwards.
 
@@ -125,7 +125,7 @@ class Live:
         sweeps : int, optional
             End after so many.
         told : callable
-            Called when everything is ready and the sensor starts.
+            Told, in a line, when everything is ready and the sensor starts, and of what goes wrong.
 
         Raises
         ------
@@ -134,12 +134,13 @@ class Live:
         """
         self._insist_on_motion("a sensor")
         clock = host_clock()
-        device = Hokuyo(port, clock=clock, guard=True)
+        device = Hokuyo(port, clock=clock, guard=True, told=told)
         try:
             with device:
                 steps = device.parameters.steps(-field, field)
+                told(f"joint {self.joint.id}: getting ready")
                 place = self._ready()
-                told()
+                told(f"joint {self.joint.id}: go")
                 with closing(device.scans(*steps, count=sweeps)) as stream:  # type: ignore[type-var]
                     for sweep in stream:
                         if device.waiting > MOST_WAITING:

@@ -44,6 +44,8 @@ class Hokuyo:
         Host's clock, s.
     guard : bool
         Let a second process watch over the port, which switches the laser off when this one is killed.
+    told : callable
+        Told, in a line, when the device goes away or falls silent during a stream, and when it is back.
 
     Attributes
     ----------
@@ -63,6 +65,7 @@ class Hokuyo:
         synchronise: bool = True,
         clock: Callable[[], float] | None = None,
         guard: bool = False,
+        told: Callable[[str], None] = lambda text: None,
     ) -> None:
         self._asked_port = port
         self._baud = baud
@@ -71,6 +74,7 @@ class Hokuyo:
         self._synchronise = synchronise
         self._clock = clock or host_clock()
         self._guard = Guard() if guard else None
+        self._told = told
         self._line: Line | None = None
         self._counts = dict.fromkeys(Counters.__dataclass_fields__, 0)
         self._exits = contextlib.ExitStack()
@@ -336,6 +340,7 @@ class Hokuyo:
         silent = SensorError("the rangefinder fell silent", file=line.port, remedy="look after its cable")
         if failures > 3:
             raise silent
+        self._told(f"{line.port}: the rangefinder fell silent; starting it anew")
         try:
             start_up(line, self._timeout)
         except Unplugged:
@@ -351,9 +356,11 @@ class Hokuyo:
         old.close()
         self._take_counts(old)
         deadline = time.monotonic() + self._reconnect
+        self._told(f"{old.port}: the rangefinder was unplugged; waiting {self._reconnect:g} s for it")
         while True:
             try:
                 self.open()
+                self._told(f"{self.port}: the rangefinder is back")
                 return
             except SensorError as error:
                 if time.monotonic() >= deadline:

@@ -63,7 +63,9 @@ class Sweep:
     ) -> Sweep:
         """Make it of a scan's values, shape (request.size,)."""
         steps = request.middles
-        measured = (values >= FIRST_MEASUREMENT) & (values <= parameters.dmax)
+        # Two characters end at 4095, which may stand for anything farther.
+        most = parameters.dmax if request.width == 3 else min(parameters.dmax, 4094)
+        measured = (values >= FIRST_MEASUREMENT) & (values <= most)
         return cls(
             index,
             np.where(measured, values / 1000.0, np.nan),

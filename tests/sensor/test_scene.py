@@ -93,6 +93,14 @@ def test_codes_become_missing_ranges_with_reasons():
     assert sweep.times[384 - 44] == pytest.approx(sweep.stamp_host + 0.0375)
 
 
+def test_two_characters_cannot_say_how_far_it_is_beyond_their_last():
+    values, wide = np.array([4094, 4095, 19]), ScanRequest("MD", 44, 46)
+    short = sweep_of(values, request=ScanRequest("MS", 44, 46))
+    np.testing.assert_array_equal(short.ranges, [4.094, np.nan, np.nan])
+    assert short.reasons == ("", "beyond the sensor's range", "not measurable")
+    np.testing.assert_array_equal(sweep_of(values, request=wide).ranges, [4.094, 4.095, np.nan])
+
+
 def test_recordings_are_replayed_as_they_are():
     rng = np.random.default_rng(2)
     rows = [rng.integers(0, 5600, 682) for _ in range(3)]
