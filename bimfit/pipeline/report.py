@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 import tempfile
@@ -268,5 +269,6 @@ def _pictures(joint: JointDocument, folder: Path) -> tuple[Picture, ...]:
     for kind in PICTURES:
         file = folder / f"{kind}-{safe_name(joint.id)}.png"
         if kind in _CAPTIONS and file.is_file():
-            made.append(Picture(embedded_picture(file), _CAPTIONS[kind]))
+            with contextlib.suppress(OSError):  # a damaged picture is left out
+                made.append(Picture(embedded_picture(file), _CAPTIONS[kind]))
     return tuple(made)

@@ -142,6 +142,21 @@ def test_the_command_keeps_the_limits_of_the_fit(tmp_path, capsys):
         assert len(capsys.readouterr().err.strip().splitlines()) == 1
 
 
+def test_damaged_files_of_the_folder(tmp_path, capsys):
+    """A picture that cannot be read is left out; a mesh that cannot is one clear line."""
+    joints = sample_joints()[:1]
+    joints[0]["meshes"] = {"ply": "gap-good.ply"}
+    folder = write_folder(tmp_path, joints)
+    (folder / "scene-good.png").write_bytes(b"\x89PNG\r\n\x1a\n and no more")
+    assert main(["report", str(folder)]) == 0
+    assert "data:image/jpeg" not in (folder / "report.html").read_text(encoding="utf-8")
+    capsys.readouterr()
+    (folder / "gap-good.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 9")
+    assert main(["report", str(folder)]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "gap-good.ply" in line and "internal error" not in line
+
+
 def test_no_input_is_overwritten(tmp_path):
     folder = write_folder(tmp_path, sample_joints(), model=tmp_path / "report.html")
     (folder / "report.html").write_text("a model by an odd name")
