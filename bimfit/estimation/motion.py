@@ -10,6 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from bimfit.errors import ConfigError
+from bimfit.estimation import _kernels_knots as kernels
 from bimfit.estimation import trend
 from bimfit.estimation.borrow import FLAG, at_corner, borrow
 from bimfit.estimation.result import ComponentEstimate, StationEstimate
@@ -81,15 +82,15 @@ def estimate_joint(
     if model == "independent" or min(int(p.known.sum()) for p in parts) < _FEW:
         return JointEstimate(stations, "independent")
     fits: dict[str, tuple[Trend, Trend]] = {}
+    bases: dict[str, tuple[Basis, Basis]] = {}
     criterion: dict[str, float] = {}
     knots = np.zeros(0)
     for name in ("const", "rigid", "linear", "smooth", "kinked") if model == "auto" else (model,):
         if name == "kinked":
             screen = fits.get("smooth") or _fit_pair(parts, _bases("smooth", parts, knots))
             knots = _find_knots(parts, [t.weight for t in screen])
-        bases = _bases(name, parts, knots)
-        pair = _fit_pair(parts, bases)
-        fits[name] = pair
+        bases[name] = _bases(name, parts, knots)
+        pair = fits[name] = _fit_pair(parts, bases[name])
         # the smooth model's two hyper-parameters a component are fitted too
         freedom = sum(t.freedom for t in pair) + (4.0 if name == "smooth" else 0.0)
         if name == "kinked":
@@ -97,7 +98,10 @@ def estimate_joint(
         count = sum(int(p.known.sum()) for p in parts)
         criterion[name] = sum(t.deviance for t in pair) + freedom * math.log(count)
     chosen = _choose(criterion)
-    out, outliers = _apply(stations, sections, parts, fits[chosen])
+    fitted = tuple(
+        trend.with_shared_cells(p, b, t) for p, b, t in zip(parts, bases[chosen], fits[chosen], strict=True)
+    )
+    out, outliers = _apply(stations, sections, parts, (fitted[0], fitted[1]))
     return JointEstimate(out, chosen, criterion, knots if chosen == "kinked" else np.zeros(0), outliers)
 
 
@@ -180,96 +184,20 @@ def _motion_of(pose: Pose2D, corner: Array) -> Array:
 
 def _find_knots(parts: tuple[Sites, Sites], weights: Sequence[Array]) -> Array:
     """Knots shared by both components: added while they pay, moved, and dropped where they do not."""
-    s = parts[0].s
-    known = np.flatnonzero(parts[0].known | parts[1].known)
-    inner = [int(i) for i in known[1:-1]]
-    knots = [int(known[0]), int(known[-1])]
-    cost = _cost(parts, s, knots, weights)
-    while inner:
-        gains = _gains(parts, s, knots, inner, weights)
-        pick = int(np.argmax(gains))
-        trial = sorted([*knots, inner[pick]])
-        trial, after = _shift(parts, s, trial, weights, around=inner[pick])
-        if cost - after < _KEEP_KNOT:
-            break
-        knots, cost = trial, after
-        inner = [i for i in inner if min(abs(i - k) for k in knots) > 1]
-    for _ in range(2):
-        knots, cost = _shift(parts, s, knots, weights)
-        knots, cost = _drop(parts, s, knots, weights, cost)
-    return s[knots]
-
-
-def _cost(parts: tuple[Sites, Sites], s: Array, knots: Sequence[int], weights: Sequence[Array]) -> float:
-    """Weighted sum of squares of both components at these knots."""
-    B = trend.hats(s, s[list(knots)])
-    basis = Basis(B, np.ones((B.shape[1], 3), bool))
-    total = 0.0
-    for sites, weight in zip(parts, weights, strict=True):
-        beta, _, design = trend.solve(sites, basis, weight)
-        e = sites.value - design @ beta
-        q = np.einsum("ia,iab,ib->i", e, sites.precision, e)
-        total += float(weight @ q)
-    return total
-
-
-def _gains(
-    parts: tuple[Sites, Sites], s: Array, knots: Sequence[int], inner: Sequence[int], weights: Sequence[Array]
-) -> Array:
-    """How much each further kink would lower the sum of squares, to first order exact."""
-    B = trend.hats(s, s[list(knots)])
-    basis = Basis(B, np.ones((B.shape[1], 3), bool))
-    ramps = np.maximum(s[:, None] - s[list(inner)][None, :], 0.0)
-    out = np.zeros(len(inner))
-    for sites, weight in zip(parts, weights, strict=True):
-        beta, cov, design = trend.solve(sites, basis, weight)
-        e = sites.value - design @ beta
-        L = sites.precision * weight[:, None, None]
-        g = np.einsum("ic,iab,ib->ca", ramps, L, e, optimize=True)
-        S = np.einsum("ic,iab->cab", ramps**2, L, optimize=True)
-        cross = np.einsum("ic,iab,ibf->caf", ramps, L, design, optimize=True)
-        S = S - np.einsum("caf,fg,cbg->cab", cross, cov, cross, optimize=True)
-        S[:, [0, 1, 2], [0, 1, 2]] += 1e-3 + 1e-9 * S[:, [0, 1, 2], [0, 1, 2]]  # as in solve()
-        out += np.einsum("ca,ca->c", g, np.linalg.solve(S, g[:, :, None])[:, :, 0])
-    return out
-
-
-def _shift(
-    parts: tuple[Sites, Sites],
-    s: Array,
-    knots: Sequence[int],
-    weights: Sequence[Array],
-    around: int | None = None,
-) -> tuple[list[int], float]:
-    """Move inner knots by up to three stations where that lowers the cost."""
-    out = list(knots)
-    cost = _cost(parts, s, out, weights)
-    for j in range(1, len(out) - 1):
-        if around is not None and out[j] != around:
-            continue
-        here = out[j]
-        for d in (-3, -2, -1, 1, 2, 3):
-            if not out[j - 1] < here + d < out[j + 1]:
-                continue
-            trial = [*out[:j], here + d, *out[j + 1 :]]
-            after = _cost(parts, s, trial, weights)
-            if after < cost:
-                out, cost = trial, after
-    return out, cost
-
-
-def _drop(
-    parts: tuple[Sites, Sites], s: Array, knots: list[int], weights: Sequence[Array], cost: float
-) -> tuple[list[int], float]:
-    """Take out the knots that do not pay, the least useful first."""
-    while len(knots) > 2:
-        trials = [[*knots[:j], *knots[j + 1 :]] for j in range(1, len(knots) - 1)]
-        after = [_cost(parts, s, t, weights) for t in trials]
-        j = int(np.argmin(after))
-        if after[j] - cost > _KEEP_KNOT:
-            break
-        knots, cost = trials[j], after[j]
-    return knots, cost
+    s = np.ascontiguousarray(parts[0].s - parts[0].s.mean())
+    sums = np.empty((2, len(s) + 1, kernels.COLUMNS))
+    for sites, weight, out in zip(parts, weights, sums, strict=True):
+        kernels.prefix_sums(s, sites.value, sites.precision * weight[:, None, None], out)
+    known = parts[0].known | parts[1].known
+    at = np.flatnonzero(known)
+    known[at[:2]] = known[at[-2:]] = False
+    step = -(-len(s) // trend.NODES)
+    if step > 1:  # stations that dense do not each need a knot
+        known &= np.arange(len(s)) % step == 0
+    knots = np.zeros(min(len(s), trend.NODES) + 2, np.int64)
+    knots[:2] = at[0], at[-1]
+    count = kernels.find_knots(s, sums, known, _KEEP_KNOT, 3 * step, knots)
+    return np.asarray(parts[0].s[knots[:count]])
 
 
 def _apply(

@@ -6,7 +6,8 @@ x = (u, v, theta). Stations enter by what their ranges say alone: precision L_i 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,8 @@ from numpy.typing import NDArray
 from bimfit.geometry.pose import Array
 
 Mask = NDArray[np.bool_]
+NODES = 150
+"""Stations denser than so many along a joint are not each a knot, or a node of the smooth model."""
 _NU = 4.0
 _JUMP = np.array([0.004, 0.004, 0.035])
 """What a station that jumps is off by, standard deviations in u, v (m) and theta (rad)."""
@@ -65,6 +68,8 @@ class Trend:
         -2 log likelihood of the stations, Student with 4 degrees of freedom, up to a constant.
     freedom : float
         Effective number of parameters.
+    spread : ndarray, shape (free, free)
+        Covariance of the coefficients.
     """
 
     value: Array
@@ -74,6 +79,7 @@ class Trend:
     jump: Array
     deviance: float
     freedom: float
+    spread: Array = field(repr=False)
 
 
 @dataclass(frozen=True)
@@ -83,6 +89,7 @@ class Basis:
     Attributes
     ----------
     functions : ndarray, shape (n, k)
+        At most two neighbouring ones differ from zero at a station.
     moves : ndarray of bool, shape (k, 3)
     penalty : ndarray, shape (k, k, 3), or None
         Prior precision of the coefficients, one matrix a coordinate.
@@ -91,6 +98,13 @@ class Basis:
     functions: Array
     moves: Mask
     penalty: Array | None = None
+
+    @cached_property
+    def local(self) -> tuple[NDArray[np.int64], Array]:
+        """The first of the two functions at every station (n,), and their values (n, 2)."""
+        first = np.minimum(np.argmax(self.functions != 0.0, axis=1), self.functions.shape[1] - 2)
+        at = first[:, None] + np.arange(2)
+        return first, np.take_along_axis(self.functions, at, axis=1)
 
 
 def hats(s: Array, knots: Array) -> Array:
@@ -105,14 +119,20 @@ def polynomial(s: Array, *, turning: bool, moving: bool = True) -> Basis:
     return Basis(np.stack([np.ones_like(t), t], axis=1), moves)
 
 
+def nodes(s: Array) -> Array:
+    """Where the smooth model's functions peak: at every station, or, where these are many, at some."""
+    step = -(-len(s) // NODES)
+    return s if step == 1 else np.unique(np.r_[s[::step], s[-1]])
+
+
 def smooth(s: Array, roughness: tuple[float, float]) -> Basis:
     """An integrated random walk: slopes change by N(0, roughness^2 h) over h, for u and v and for theta."""
-    n = len(s)
-    walk = bends(s)
+    at = nodes(s)
+    walk = bends(at)
     penalty = np.stack(
         [walk / roughness[0] ** 2, walk / roughness[0] ** 2, walk / roughness[1] ** 2], axis=-1
     )
-    return Basis(np.eye(n), np.ones((n, 3), bool), penalty)
+    return Basis(np.eye(len(s)) if at is s else hats(s, at), np.ones((len(at), 3), bool), penalty)
 
 
 def bends(s: Array) -> Array:
@@ -127,31 +147,52 @@ def bends(s: Array) -> Array:
     return np.asarray(D.T @ D)
 
 
-def solve(sites: Sites, basis: Basis, weight: Array) -> tuple[Array, Array, Array]:
-    """Coefficients (free,), their covariance (free, free) and each station's design (n, 3, free)."""
-    n, k = basis.functions.shape
+def information(basis: Basis, blocks: Array) -> Array:
+    """Sum over stations of X_i^T B_i X_i for blocks (n, 3, 3), shape (3 k, 3 k)."""
+    k = basis.functions.shape[1]
+    first, w = basis.local
+    A = np.zeros((k, k, 3, 3))
+    for p in (0, 1):
+        for q in (0, 1):
+            np.add.at(A, (first + p, first + q), blocks * (w[:, p] * w[:, q])[:, None, None])
+    return A.transpose(0, 2, 1, 3).reshape(3 * k, 3 * k)
+
+
+def solve(sites: Sites, basis: Basis, weight: Array) -> tuple[Array, Array]:
+    """Coefficients (k, 3) and their covariance (free, free), of those that move."""
+    k = basis.functions.shape[1]
     free = basis.moves.ravel()
-    design = np.einsum("ik,ab->iakb", basis.functions, np.eye(3)).reshape(n, 3, 3 * k)[:, :, free]
     L = sites.precision * weight[:, None, None]
-    flat = design.reshape(3 * n, -1)
-    LX = np.matmul(L, design).reshape(3 * n, -1)
-    A = flat.T @ LX
+    A = information(basis, L)
     if basis.penalty is not None:
-        P = np.zeros((k, 3, k, 3))
+        P = A.reshape(k, 3, k, 3)
         for a in range(3):
-            P[:, a, :, a] = basis.penalty[:, :, a]
-        A += P.reshape(3 * k, 3 * k)[np.ix_(free, free)]
+            P[:, a, :, a] += basis.penalty[:, :, a]
+    if not free.all():
+        A = A[np.ix_(free, free)]
     A[np.diag_indices_from(A)] += 1e-3
     cov = np.linalg.inv(A)
-    return cov @ (LX.T @ sites.value.ravel()), cov, design
+    right = basis.functions.T @ np.einsum("iab,ib->ia", L, sites.value)
+    beta = np.zeros(3 * k)
+    beta[free] = cov @ right.ravel()[free]
+    return beta.reshape(k, 3), np.asarray(cov)
 
 
-def _blocks(M: Array, design: Array) -> Array:
-    """X_i M X_i^T of every station, shape (n, 3, 3)."""
-    n = design.shape[0]
-    if design.shape[2] == 3 * n:  # every station is its own node
-        return np.ascontiguousarray(np.einsum("iaib->iab", M.reshape(n, 3, n, 3)))
-    return np.asarray(np.matmul(np.matmul(design, M), design.transpose(0, 2, 1)))
+def _blocks(M: Array, basis: Basis) -> Array:
+    """X_i M X_i^T of every station, shape (n, 3, 3), for M (free, free)."""
+    k = basis.functions.shape[1]
+    free = basis.moves.ravel()
+    if not free.all():
+        full = np.zeros((3 * k, 3 * k))
+        full[np.ix_(free, free)] = M
+        M = full
+    M = M.reshape(k, 3, k, 3)
+    first, w = basis.local
+    out = np.zeros((len(first), 3, 3))
+    for p in (0, 1):
+        for q in (0, 1):
+            out += M[first + p, :, first + q, :] * (w[:, p] * w[:, q])[:, None, None]
+    return out
 
 
 def fit(sites: Sites, basis: Basis, *, rounds: int = 4) -> Trend:
@@ -159,42 +200,35 @@ def fit(sites: Sites, basis: Basis, *, rounds: int = 4) -> Trend:
     n = len(sites.s)
     weight = np.ones(n)
     for _ in range(rounds):
-        beta, cov, design = solve(sites, basis, weight)
-        distance, _ = _left_out(sites, weight, beta, cov, design)
+        beta, cov = solve(sites, basis, weight)
+        distance, _ = _left_out(sites, weight, basis.functions @ beta, _blocks(cov, basis))
         new = np.minimum((_NU + 3.0) / (_NU + distance), 1.0)
         done = float(np.abs(new - weight).max()) < 0.01
         weight = new
         if done:
             break
-    beta, cov, design = solve(sites, basis, weight)
-    value = design @ beta
+    beta, cov = solve(sites, basis, weight)
+    value, V = basis.functions @ beta, _blocks(cov, basis)
     e = sites.value - value
     q = np.einsum("ia,iab,ib->i", e, sites.precision, e)
     known = sites.known
     deviance = float(np.sum((_NU + 3.0) * np.log1p(q[known] / _NU)))
-    freedom = float(
-        np.einsum(
-            "fg,iaf,iab,ibg->", cov, design, sites.precision * weight[:, None, None], design, optimize=True
-        )
-    )
-    V = np.einsum("iaf,fg,ibg->iab", design, cov, design, optimize=True)
-    V = V + _shared_cells(sites, weight, cov, design)
-    distance, jump = _left_out(sites, weight, beta, cov, design)
-    return Trend(value, V, weight, distance, jump, deviance, freedom)
+    freedom = float(np.einsum("iab,iba,i->", V, sites.precision, weight))
+    distance, jump = _left_out(sites, weight, value, V)
+    return Trend(value, V, weight, distance, jump, deviance, freedom, cov)
 
 
-def _left_out(sites: Sites, weight: Array, beta: Array, cov: Array, design: Array) -> tuple[Array, Array]:
+def _left_out(sites: Sites, weight: Array, value: Array, V: Array) -> tuple[Array, Array]:
     """Squared Mahalanobis distance of every station from the fit to the others; how likely it has jumped.
 
     The latter is the posterior probability of a residual N(0, S + J) against N(0, S), J that of a jump.
     """
-    V = _blocks(cov, design)
     # regularised, for a station may say nothing about one direction
     C = np.linalg.inv(sites.precision + np.diag([400.0, 400.0, 4.0]))
     W = C / np.maximum(weight, 1e-3)[:, None, None]
     # the fit without a station: its residual grows, and the fit's own covariance does too
     gain = V @ np.linalg.inv(W - V + 1e-15 * np.eye(3))
-    e = sites.value - design @ beta
+    e = sites.value - value
     e = e + np.einsum("iab,ib->ia", gain, e)
     spread = C + V + gain @ V
     near = np.einsum("ia,ia->i", e, np.linalg.solve(spread, e[:, :, None])[:, :, 0])
@@ -206,46 +240,48 @@ def _left_out(sites: Sites, weight: Array, beta: Array, cov: Array, design: Arra
     return np.where(known, np.maximum(near, 0.0), 0.0), np.where(known, 1.0 / (1.0 + np.exp(-odds)), 0.0)
 
 
-def _shared_cells(sites: Sites, weight: Array, cov: Array, design: Array) -> Array:
-    """What neighbouring stations have in common because they see a corner through the same beams.
+def with_shared_cells(sites: Sites, basis: Basis, trend: Trend) -> Trend:
+    """The trend with what neighbouring stations have in common because they see a corner by the same beams.
 
     With no drift every slice sees the corner between the same two beams, so that averaging does not help
-    across the gap; V = V0 + K E K^T (METHOD, section 5).
+    across the gap; V = V0 + K E K^T (METHOD, section 5). The correlation (1 - 6 f (1 - f)) exp(-(d / 2.5)^2)
+    is a sum of cosines of d, all positive, times a Gaussian, and so positive definite.
     """
-    known = sites.known & np.isfinite(sites.step)
-    n = len(sites.s)
-    if known.sum() < 2:
-        return np.zeros((n, 3, 3))
-    k = np.flatnonzero(known)
+    k = np.flatnonzero(sites.known & np.isfinite(sites.step))
+    if len(k) < 2:
+        return trend
     d = sites.step[k, None] - sites.step[None, k]
     f = d - np.floor(d)
     rho = (1.0 - 6.0 * f * (1.0 - f)) * np.exp(-((d / 2.5) ** 2))
-    values, axes = np.linalg.eigh(rho)
-    rho = (axes * np.maximum(values, 0.0)) @ axes.T
-    np.fill_diagonal(rho, np.maximum(np.diag(rho) - 1.0, 0.0))
+    np.fill_diagonal(rho, 0.0)
     s = 1.0 / np.sqrt(np.maximum(sites.precision[k, 0, 0], 1e-6))
-    G = cov @ np.einsum("iaf,ia->fi", design[k], sites.precision[k, :, 0] * weight[k, None])
-    extra = _blocks(G @ (rho * s[:, None] * s[None, :]) @ G.T, design)
+    pull = sites.precision[k, :, 0] * trend.weight[k, None]
+    R = np.einsum("ik,ia->kai", basis.functions[k], pull).reshape(-1, len(k))
+    G = trend.spread @ R[basis.moves.ravel()]
+    extra = _blocks((G * s) @ rho @ (G * s).T, basis)
     values, axes = np.linalg.eigh(extra)
-    return np.asarray(np.einsum("iab,ib,icb->iac", axes, np.maximum(values, 0.0), axes))
+    extra = np.einsum("iab,ib,icb->iac", axes, np.maximum(values, 0.0), axes)
+    return replace(trend, covariance=trend.covariance + extra)
 
 
 class Evidence:
     """Log marginal likelihood of one component's stations under the smooth model, banded."""
 
     def __init__(self, sites: Sites) -> None:
-        n = len(sites.s)
-        self.n = n
-        walk = bends(sites.s)
+        at = nodes(sites.s)
+        self.n = n = len(at)
+        basis = Basis(np.eye(n) if at is sites.s else hats(sites.s, at), np.ones((n, 3), bool))
+        A = information(basis, sites.precision)
+        walk = bends(at)
         self.ranges = np.zeros((9, 3 * n))
         self.walks = np.zeros((2, 9, 3 * n))
+        for lag in range(min(6, 3 * n)):
+            self.ranges[lag, : 3 * n - lag] = np.diagonal(A, -lag)
         for a in range(3):
-            for b in range(a + 1):
-                self.ranges[a - b, b::3] = sites.precision[:, a, b]
             for lag in range(min(3, n)):
                 self.walks[int(a == 2), 3 * lag, a : 3 * (n - lag) : 3] = np.diagonal(walk, -lag)
         self.ranges[0] += 1e-3
-        self.right = np.einsum("iab,ib->ia", sites.precision, sites.value).ravel()
+        self.right = (basis.functions.T @ np.einsum("iab,ib->ia", sites.precision, sites.value)).ravel()
 
     def __call__(self, roughness: tuple[float, float]) -> float:
         """At one pair of hyper-parameters, up to a constant."""

@@ -9,9 +9,10 @@ import pytest
 
 from bimfit.config import SensorConfig
 from bimfit.errors import ConfigError
+from bimfit.estimation import _kernels_knots as kernels
 from bimfit.estimation.motion import estimate_joint
 from bimfit.estimation.result import ComponentEstimate, StationEstimate
-from bimfit.estimation.trend import Basis, Evidence, Sites, bends, fit, hats, polynomial, smooth, solve
+from bimfit.estimation.trend import NODES, Basis, Evidence, Sites, bends, fit, hats, polynomial, smooth, solve
 from bimfit.geometry.frame import SectionFrame
 from bimfit.geometry.joint_section import GapOutline, JointSection
 from bimfit.geometry.pose import Pose2D
@@ -248,11 +249,12 @@ def test_least_squares_agrees_with_numpy():
     rng = np.random.default_rng(9)
     sites = _random_sites(rng)
     basis = Basis(hats(sites.s, sites.s[[0, 9, 20, 29]]), np.ones((4, 3), bool))
-    beta, cov, design = solve(sites, basis, np.ones(30))
+    beta, cov = solve(sites, basis, np.ones(30))
+    design = np.einsum("ik,ab->iakb", basis.functions, np.eye(3)).reshape(30, 3, 12)
     root = np.linalg.cholesky(sites.precision).transpose(0, 2, 1)
     A = (root @ design).reshape(90, -1)
     y = np.einsum("iab,ib->ia", root, sites.value).ravel()
-    assert np.allclose(beta, np.linalg.lstsq(A, y, rcond=None)[0], rtol=1e-6, atol=1e-9)
+    assert np.allclose(beta.ravel(), np.linalg.lstsq(A, y, rcond=None)[0], rtol=1e-6, atol=1e-9)
     assert np.allclose(cov, np.linalg.inv(A.T @ A), rtol=1e-5)
 
 
@@ -286,3 +288,55 @@ def test_smooth_model_is_the_straight_line_in_the_limit():
     line = fit(sites, polynomial(sites.s, turning=True), rounds=0)
     assert np.allclose(stiff.value, line.value, atol=2e-5)
     assert stiff.freedom == pytest.approx(6.0, abs=0.05)
+
+
+def test_messages_along_the_knots_give_the_least_sum_of_squares():
+    rng = np.random.default_rng(14)
+    parts = (_random_sites(rng), _random_sites(rng))
+    s = parts[0].s
+    sums = np.empty((2, 31, kernels.COLUMNS))
+    for sites, out in zip(parts, sums, strict=True):
+        kernels.prefix_sums(s, sites.value, sites.precision, out)
+    for knots in ([0, 29], [0, 7, 8, 20, 29], [0, 1, 2, 28, 29]):
+        B = hats(s, s[knots])
+        total = 0.0
+        for sites in parts:
+            root = np.linalg.cholesky(sites.precision).transpose(0, 2, 1)
+            A = (root @ np.einsum("ik,ab->iakb", B, np.eye(3)).reshape(30, 3, -1)).reshape(90, -1)
+            y = np.einsum("iab,ib->ia", root, sites.value).ravel()
+            total += float(np.linalg.lstsq(A, y, rcond=None)[1][0])
+        assert kernels.cost_of(s, sums, np.array(knots)) == pytest.approx(total, rel=1e-5)
+
+
+@pytest.mark.parametrize("model", ["auto", "smooth", "kinked"])
+def test_no_pattern_of_missing_stations_is_an_exception(model):
+    rng = np.random.default_rng(15)
+    every = _stations(rng, _truth("kinked", rng))
+    sections = _sections()
+    masks = [np.zeros(N, bool) for _ in range(6)]
+    masks[0][:3] = masks[1][-3:] = masks[2][[0, 41, 82]] = masks[3][40:] = masks[4][[10, 11]] = True
+    masks += [rng.random(N) < share for share in (0.05, 0.3, 0.95)]
+    for mask in masks:
+        stations = list(every)
+        for i in np.flatnonzero(~mask):
+            _lose(stations, i, which=(0, 1) if rng.random() < 0.7 else (rng.integers(2),))
+        result = estimate_joint(stations, sections, model)
+        for e in result.stations:
+            for c in e.components:
+                assert c.pose is None or np.isfinite([*c.pose.as_array(), *c.covariance.ravel()]).all()
+
+
+def test_many_dense_stations_are_as_good_as_few_and_not_slow_beyond_reason():
+    """Nodes are fewer than stations here: what they say together must still be what they say."""
+    rng = np.random.default_rng(16)
+    n = 600
+    s = np.linspace(0.0, 1.2, n)
+    truth = 5e-3 * np.sin(3.0 * s)[:, None] * np.array([1.0, 1.0, 4.0])
+    precision = np.broadcast_to(np.diag(1.0 / SD**2), (n, 3, 3)).copy()
+    sites = Sites(s, truth + rng.normal(0.0, SD, (n, 3)), precision, np.full(n, np.nan))
+    basis = smooth(s, (0.05, 0.2))
+    assert basis.functions.shape[1] <= NODES + 1
+    t = fit(sites, basis)
+    error = (t.value - truth) / np.sqrt(np.diagonal(t.covariance, axis1=1, axis2=2))
+    assert np.sqrt(np.mean((t.value - truth) ** 2, axis=0))[0] < SD[0] / 4.0
+    assert np.all(np.abs(np.sqrt(np.mean(error**2, axis=0)) - 1.0) < 0.35)
