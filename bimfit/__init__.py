@@ -39,12 +39,21 @@ _HOMES = {
     "Scenario": "bimfit.simulation.scenario",
     "write_survey": "bimfit.pipeline.output",
     "write_pictures": "bimfit.pipeline.pictures",
+    "Selection": "bimfit.bim.selection",
+    "choose_joints": "bimfit.bim.selection",
+    "Limits": "bimfit.pipeline.limits",
+    "judge": "bimfit.pipeline.limits",
+    "read_results": "bimfit.pipeline.document",
+    "write_schedule": "bimfit.pipeline.schedule",
+    "write_issues": "bimfit.pipeline.issues",
+    "write_report": "bimfit.pipeline.report",
 }
 
 __all__ = [
     "MATCHERS",
     "BimfitError",
     "Config",
+    "Limits",
     "LineScan",
     "MatchResult",
     "PointCloud",
@@ -52,24 +61,31 @@ __all__ = [
     "Profile",
     "Scenario",
     "SectionFrame",
+    "Selection",
     "Slice",
     "Target",
     "TriangleMesh",
     "__version__",
+    "choose_joints",
     "compare",
     "cut_joint",
     "find_joints",
     "fit_joint",
     "joint_between",
+    "judge",
     "load_config",
     "load_model",
     "model_from_elements",
     "place_cloud",
+    "read_results",
     "read_scan",
     "simulate",
     "survey",
+    "write_issues",
     "write_pictures",
+    "write_report",
     "write_scan",
+    "write_schedule",
     "write_survey",
 ]
 
@@ -89,6 +105,7 @@ def __dir__() -> list[str]:
 if TYPE_CHECKING:
     from bimfit.bim.joints import find_joints, joint_between
     from bimfit.bim.model import load_model, model_from_elements
+    from bimfit.bim.selection import Selection, choose_joints
     from bimfit.config import Config, load_config
     from bimfit.errors import BimfitError
     from bimfit.geometry.frame import SectionFrame
@@ -98,9 +115,14 @@ if TYPE_CHECKING:
     from bimfit.geometry.profile import Profile
     from bimfit.geometry.slice import Slice
     from bimfit.pipeline.compare import compare
+    from bimfit.pipeline.document import read_results
     from bimfit.pipeline.fit import fit_joint
+    from bimfit.pipeline.issues import write_issues
+    from bimfit.pipeline.limits import Limits, judge
     from bimfit.pipeline.output import write_survey
     from bimfit.pipeline.pictures import write_pictures
+    from bimfit.pipeline.report import write_report
+    from bimfit.pipeline.schedule import write_schedule
     from bimfit.pipeline.simulate import simulate
     from bimfit.pipeline.survey import cut_joint, survey
     from bimfit.registration.matchers import MATCHERS

@@ -12,6 +12,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from bimfit.bim.joints import find_joints
+from bimfit.bim.model import load_model
+from bimfit.bim.validation import lost_ids, new_messages
 from bimfit.cli.main import main
 from bimfit.pipeline.document import read_results
 
@@ -137,6 +140,18 @@ def test_the_model_holds_the_same_gap_and_what_moved(far):
         )
         assert np.linalg.norm(after - before) == pytest.approx(moved["Distance"], abs=1e-4)
         assert 0.1 < moved["Distance"] < 60.0  # mm: it moved, and not by kilometres
+
+
+def test_our_own_gaps_are_no_building(far):
+    """The as-built model as the next run's model: the same elements, and the gaps fill and join nothing."""
+    model, out, _ = far
+    before, after = load_model(model), load_model(out / "as-built.ifc")
+    assert [e.guid for e in after.elements] == [e.guid for e in before.elements]
+    (joint,) = find_joints(after)
+    assert joint.filler is None and joint.state == "open"
+    assert new_messages(model, out / "as-built.ifc") == []
+    assert lost_ids(model, out / "as-built.ifc") == []
+    assert lost_ids(out / "as-built.ifc", model) != []
 
 
 def test_the_document_reads_what_was_written(far):
