@@ -55,6 +55,9 @@ def run(
         metavar="FREEDOMS",
         help="Free the components' shapes, with priors: bevel-angle=2deg,face-angle=1deg,thickness=1mm.",
     ),
+    profile: Path | None = typer.Option(
+        None, "--profile", metavar="FILE", help="A profile that bimfit teach wrote, in place of the design."
+    ),
     config: Path | None = typer.Option(None, "--config", metavar="FILE.toml", help="Settings."),
     pictures: bool = typer.Option(True, help="Draw pictures."),
     report: bool = typer.Option(True, help="Write report.html."),
@@ -73,6 +76,7 @@ def run(
     from bimfit.pipeline.deliver import Deliverables, check_deliverables, deliver
     from bimfit.pipeline.limits import Limits
     from bimfit.pipeline.output import check_folder, describe
+    from bimfit.pipeline.profile_file import read_profile
     from bimfit.pipeline.survey import survey
 
     settings = build_config(
@@ -94,7 +98,7 @@ def run(
         bcf_version=bcf_version,  # type: ignore[arg-type]  # checked below
     )
     check_folder(output)
-    inputs = [model, scan, *(path for path in (config, choice.pairs) if path is not None)]
+    inputs = [model, scan, *(path for path in (config, choice.pairs, profile) if path is not None)]
     check_deliverables(wanted, output, inputs)
     with terminal_progress() as progress:
         result = survey(
@@ -105,6 +109,7 @@ def run(
             method=method,
             motion=motion,
             placing=where,
+            profile=None if profile is None else read_profile(profile),
             progress=progress,
         )
         _, said = deliver(result, output, wanted, progress)

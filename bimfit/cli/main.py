@@ -23,6 +23,7 @@ from bimfit.cli import (
     live,
     report,
     simulate,
+    teach,
     view,
 )
 from bimfit.errors import BimfitError
@@ -50,6 +51,7 @@ app.command("emulate")(emulate.run)
 app.command("live")(live.run)
 app.command("view")(view.run)
 app.command("report")(report.run)
+app.command("teach")(teach.run)
 app.command("bench")(bench.run)
 
 

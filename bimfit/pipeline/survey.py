@@ -21,6 +21,7 @@ from bimfit.geometry.slice import Slice
 from bimfit.pipeline.fit import check_choice, fit_joint
 from bimfit.pipeline.listing import model_joints as model_joints
 from bimfit.pipeline.placing import NEAR, Placed, Placing, joint_boxes, place_scan
+from bimfit.pipeline.profile_file import TaughtProfile
 from bimfit.pipeline.records import JointResult, SurveyResult
 from bimfit.pipeline.shown import share_shown
 from bimfit.pipeline.targets import match_reach, with_assumed_view, with_recovered_view
@@ -57,6 +58,7 @@ def survey(
     motion: str = "auto",
     scan_pose: Array | None = None,
     placing: Placing | None = None,
+    profile: TaughtProfile | None = None,
     progress: Progress = silent,
 ) -> SurveyResult:
     """Fit every joint that is asked for, or every joint that the scan shows.
@@ -76,6 +78,8 @@ def survey(
         T_world_scanner of a scan in scanner coordinates; short for ``Placing(pose=...)``.
     placing : Placing, optional
         How the scan is read and where it lies.
+    profile : TaughtProfile, optional
+        Taught by :func:`bimfit.pipeline.teach.teach`; it takes the place of the designed cross-sections.
     progress : callable
         Told (step, share done).
 
@@ -94,6 +98,8 @@ def survey(
     progress("cutting the joints", 0.0)
     cuts = [cut_joint(model, joint, part_of(placed.nearby, joint, config), config) for joint in chosen]
     cuts, partly = (cuts, "") if asked else fully_shown(cuts, config)
+    if profile is not None:
+        cuts = [(facing, profile.applied(sections), slices) for facing, sections, slices in cuts]
     for k, (facing, sections, slices) in enumerate(cuts):
         step = f"joint {facing.id} ({k + 1} of {len(cuts)})"
         results.append(
