@@ -10,11 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import bimfit.scan.formats.las as las
+import bimfit.scan.formats.pcd as pcd
+import bimfit.scan.formats.ply as ply
 from bimfit.errors import ScanError
 from bimfit.geometry.pose import transform_points
 from bimfit.scan.boxes import Boxes
 from bimfit.scan.cloud import PointCloud
-from bimfit.scan.formats import FORMATS, read_scan, scan_chunks, write_scan
+from bimfit.scan.formats import FORMATS, read_scan, scan_chunks, text, write_scan
 from bimfit.scan.formats.las import read_las
 from bimfit.scan.formats.options import ReadOptions
 
@@ -109,12 +111,16 @@ SUFFIXES = [s for form in FORMATS for s in form.extensions if form.write or s in
 def test_pieces_are_the_file(tmp_path, monkeypatch, suffix: str, piece: int) -> None:
     """In order and without loss, in other units too; and with boxes at least what lies in them."""
     monkeypatch.setattr(las, "_CHUNK", piece)
+    for module in (ply, pcd):
+        monkeypatch.setattr(module, "PIECE", piece)
+    monkeypatch.setattr(text, "CHUNK", 40 * piece)
     path = tmp_path / f"cloud{suffix}"
     made = cloud(997, 45_000.0)
     WRITERS.get(suffix, write_scan)(made, path)
     whole = read_scan(path)
     assert isinstance(whole, PointCloud)
     pieces = list(scan_chunks(path))
+    assert len(pieces) > 5 or piece == 1000 or suffix in (".csv", ".npz")
     assert np.array_equal(np.concatenate([p.points for p in pieces]), whole.points)
     np.testing.assert_allclose(whole.points, made.points, atol=1e-4, rtol=0)
     said = pieces[0].notes[-1]

@@ -7,7 +7,7 @@ import pytest
 from bimfit.errors import ScanError
 from bimfit.geometry.line_scan import LineScan
 from bimfit.scan.cloud import PointCloud
-from bimfit.scan.formats import FORMATS, read_scan, write_scan
+from bimfit.scan.formats import FORMATS, read_scan, scan_chunks, write_scan
 from bimfit.scan.formats.pcd import lzf_decompress
 
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "scans"
@@ -262,6 +262,10 @@ def test_ptx_keeps_scanner_poses_and_missing_returns(tmp_path):
     assert np.count_nonzero(~scan.returned) == 2 * 31 * 5
     assert np.allclose(scan.hits, np.concatenate(hits), rtol=0, atol=1e-8)
     assert np.allclose(np.unique(scan.origins, axis=0), eyes)
+    pieces = list(scan_chunks(tmp_path / "s.ptx"))
+    assert len(pieces) == 2
+    assert np.array_equal(np.concatenate([piece.scan for piece in pieces]), scan.scan)
+    assert np.array_equal(np.concatenate([piece.hits for piece in pieces]), scan.hits)
     lines = text.splitlines()
     for bad, complaint in (
         (lines[:-1], "cut short"),

@@ -43,14 +43,14 @@ from bimfit.scan.formats.las import las_chunks, read_las, write_las
 from bimfit.scan.formats.npz import read_npz, write_npz
 from bimfit.scan.formats.options import ANY, ReadOptions, unit_name
 from bimfit.scan.formats.packing import GZIP, unpacked
-from bimfit.scan.formats.pcd import read_pcd, write_pcd
+from bimfit.scan.formats.pcd import pcd_chunks, read_pcd, write_pcd
 from bimfit.scan.formats.pictures import looks_like_sick, read_npy, read_png, read_sick, read_tiff
-from bimfit.scan.formats.ply import read_ply, write_ply
+from bimfit.scan.formats.ply import ply_chunks, read_ply, write_ply
 from bimfit.scan.formats.profiles import looks_like_profiles, read_profiles
-from bimfit.scan.formats.ptx import read_ptx
+from bimfit.scan.formats.ptx import ptx_chunks, read_ptx
 from bimfit.scan.formats.summary import summary
 from bimfit.scan.formats.text import first_lines
-from bimfit.scan.formats.xyz import looks_like_points, read_xyz, write_xyz
+from bimfit.scan.formats.xyz import looks_like_points, read_xyz, write_xyz, xyz_chunks
 
 Scan = LineScan | PointCloud
 
@@ -103,8 +103,15 @@ def _plain(read: Callable[[Path], Scan]) -> Callable[[Path, ReadOptions], Scan]:
 FORMATS: tuple[Format, ...] = (
     Format("CSV", (".csv",), _plain(read_csv), write_csv, beams=True),
     Format("NPZ", (".npz",), _plain(read_npz), write_npz, (b"PK\x03\x04",), beams=True),
-    Format("PLY", (".ply",), _plain(read_ply), write_ply, (b"ply\n", b"ply\r\n")),
-    Format("PCD", (".pcd",), _plain(read_pcd), write_pcd, (b"# .PCD", b"VERSION 0.7", b"VERSION .7")),
+    Format("PLY", (".ply",), _plain(read_ply), write_ply, (b"ply\n", b"ply\r\n"), chunks=ply_chunks),
+    Format(
+        "PCD",
+        (".pcd",),
+        _plain(read_pcd),
+        write_pcd,
+        (b"# .PCD", b"VERSION 0.7", b"VERSION .7"),
+        chunks=pcd_chunks,
+    ),
     Format("COPC", (), read_las, looks=looks_like_copc, chunks=copc_chunks),
     Format("LAS", (".las", ".laz"), read_las, write_las, (b"LASF",), chunks=las_chunks),
     Format("E57", (".e57",), read_e57, None, (b"ASTM-E57",), chunks=e57_chunks),
@@ -116,7 +123,7 @@ FORMATS: tuple[Format, ...] = (
         (b"#ROSBAG V2.0", b"\x89MCAP0\r\n", b"SQLite format 3\0"),
         chunks=bag_chunks,
     ),
-    Format("PTX", (".ptx",), _plain(read_ptx)),
+    Format("PTX", (".ptx",), _plain(read_ptx), chunks=ptx_chunks),
     Format("CARMEN log", (".clf",), _plain(read_carmen), looks=looks_like_carmen),
     Format("UBH", (".ubh",), _plain(read_ubh), looks=looks_like_ubh, unit=1e-3),
     Format("BreezySLAM", (".dat",), _plain(read_breezy), looks=looks_like_breezy, unit=1e-3),
@@ -132,7 +139,7 @@ FORMATS: tuple[Format, ...] = (
     ),
     Format("array", (".npy",), read_npy, None, (b"\x93NUMPY",), sized=True),
     Format("profiles", (), read_profiles, looks=looks_like_profiles, sized=True, unit=1e-3),
-    Format("XYZ", (".xyz", ".txt", ".pts", ".asc"), _plain(read_xyz), write_xyz),
+    Format("XYZ", (".xyz", ".txt", ".pts", ".asc"), _plain(read_xyz), write_xyz, chunks=xyz_chunks),
 )
 
 

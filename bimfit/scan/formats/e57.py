@@ -69,8 +69,11 @@ class _Scan:
 
     @property
     def eye(self) -> Array | None:
-        """Where the scanner stood, shape (3,), where the file says so."""
-        return self.T[:3, 3].copy() if self.posed else None
+        """Where the scanner stood, shape (3,), where the file says so.
+
+        A pose that moves nothing is what writers put into registered clouds, and says nothing.
+        """
+        return self.T[:3, 3].copy() if self.posed and not np.array_equal(self.T, np.eye(4)) else None
 
 
 def read_e57(path: Path, options: ReadOptions) -> LineScan | PointCloud:

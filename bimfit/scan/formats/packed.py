@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +14,48 @@ from bimfit.scan.cloud import PointCloud, usable
 
 Columns = Mapping[str, NDArray[np.generic]]
 
+PIECE = 1_000_000
+"""Rows read at a time where a file is read in pieces."""
 COARSE = 1e-4
 """A file's own precision is worth a note where it is coarser than this, m."""
 _INTENSITY = ("intensity", "scalar_intensity", "reflectance")
+
+
+def packed_rows(
+    path: Path, kind: np.dtype[np.void], count: int, start: int, size: int | None, what: str
+) -> Iterator[NDArray[np.void]]:
+    """Rows of a binary table from byte ``start`` on, ``size`` at a time, or all at once.
+
+    Raises
+    ------
+    ScanError
+        When the file is too short for ``count`` of them: "cut short: 5 of 8 ``what``".
+    """
+    have = max(path.stat().st_size - start, 0) // kind.itemsize
+    if have < count:
+        raise ScanError(f"cut short: {have} of {count} {what}", file=path)
+    step = size or count
+    for row in range(0, count, step):
+        yield np.fromfile(path, kind, min(step, count - row), offset=start + row * kind.itemsize)
+
+
+def clouds_of(
+    path: Path, pieces: Iterable[Columns], viewpoint: Array | None, notes: tuple[str, ...] = ()
+) -> Iterator[PointCloud]:
+    """Clouds of pieces of a file's columns, in which at least one point has coordinates.
+
+    Raises
+    ------
+    ScanError
+        When none has, after the last piece.
+    """
+    seen = 0
+    for columns in pieces:
+        cloud = cloud_of(path, columns, viewpoint, notes)
+        seen += len(cloud)
+        yield cloud
+    if not seen:
+        raise ScanError("the file holds no point", file=path)
 
 
 def cloud_of(
@@ -29,16 +68,10 @@ def cloud_of(
     columns : mapping of str to ndarray, shape (n,)
         At least x, y and z; normals, colours and intensity where their usual names are present.
 
-    Raises
-    ------
-    ScanError
-        When no point has coordinates.
     """
     xyz = [columns[name] for name in ("x", "y", "z")]
     points = np.stack([column.astype(np.float64) for column in xyz], axis=1)
     keep = usable(points)
-    if not keep.any():
-        raise ScanError("the file holds no point", file=path)
     lost = len(points) - int(keep.sum())
     points = points[keep]
     notes = (*notes, *precision_note(points, xyz[0].dtype))

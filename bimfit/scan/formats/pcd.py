@@ -5,6 +5,7 @@ Open3D reads PCD coordinates into single precision and drops VIEWPOINT; hence a 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,10 +15,11 @@ from numpy.typing import NDArray
 from bimfit.errors import ScanError
 from bimfit.geometry.line_scan import LineScan
 from bimfit.geometry.pose import Array
-from bimfit.scan.cloud import PointCloud, usable
+from bimfit.scan.cloud import PointCloud, joined_clouds, usable
+from bimfit.scan.formats.options import ReadOptions
 from bimfit.scan.formats.organised import beams_of
-from bimfit.scan.formats.packed import cloud_of
-from bimfit.scan.formats.text import first_lines, read_table
+from bimfit.scan.formats.packed import PIECE, clouds_of, packed_rows
+from bimfit.scan.formats.text import first_lines, read_blocks
 
 _KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 
@@ -57,25 +59,55 @@ def read_pcd(path: Path) -> LineScan | PointCloud:
     ScanError
         When it is no PCD file, is cut short or damaged, or has no x, y and z.
     """
+    header = _checked(path)
+    eye = header.viewpoint if header.viewpoint is not None else np.zeros(3)
+    if header.height > 1:
+        (columns,) = _columns(path, header, None)
+        points = np.stack([columns[n].astype(np.float64) for n in "xyz"], axis=1)
+        points[~usable(points)] = np.nan
+        grid = points.reshape(header.height, header.width, 3)
+        scan = beams_of(grid, eye, str(path), columns["x"].dtype)
+        return scan if scan is not None else joined_clouds(list(clouds_of(path, [columns], _known(eye))))
+    return joined_clouds(list(clouds_of(path, _columns(path, header, None), _known(eye))))
+
+
+def pcd_chunks(path: Path, options: ReadOptions) -> Iterator[LineScan | PointCloud]:
+    """Read a PCD file in pieces; organised and compressed ones are one piece.
+
+    Raises
+    ------
+    ScanError
+        As :func:`read_pcd` does, at the latest after the last piece.
+    """
+    header = _checked(path)
+    if header.height > 1:
+        yield read_pcd(path)
+        return
+    eye = header.viewpoint if header.viewpoint is not None else np.zeros(3)
+    yield from clouds_of(path, _columns(path, header, PIECE), _known(eye))
+
+
+def _known(eye: Array) -> Array | None:
+    return eye if np.any(eye != 0.0) else None
+
+
+def _checked(path: Path) -> _Header:
     header = _header(path)
     if not {"x", "y", "z"} <= set(header.names):
         raise ScanError("no fields x, y and z", file=path)
     if header.points <= 0:
         raise ScanError("the file holds no point", file=path)
+    return header
+
+
+def _columns(path: Path, header: _Header, size: int | None) -> Iterator[dict[str, NDArray[np.generic]]]:
+    """The fields of ``size`` points at a time, or of all."""
     if header.data == "ascii":
-        columns = _ascii(path, header)
+        yield from _ascii(path, header, size)
     elif header.data == "binary":
-        columns = _binary(path, header)
+        yield from _binary(path, header, size)
     else:
-        columns = _compressed(path, header)
-    eye = header.viewpoint if header.viewpoint is not None else np.zeros(3)
-    if header.height > 1:
-        points = np.stack([columns[n].astype(np.float64) for n in "xyz"], axis=1)
-        points[~usable(points)] = np.nan
-        scan = beams_of(points.reshape(header.height, header.width, 3), eye, str(path), columns["x"].dtype)
-        if scan is not None:
-            return scan
-    return cloud_of(path, columns, eye if np.any(eye != 0.0) else None)
+        yield _compressed(path, header)
 
 
 def write_pcd(scan: LineScan | PointCloud, path: Path) -> None:
@@ -153,24 +185,24 @@ def _fill(out: _Header, values: dict[str, list[str]]) -> None:
         raise ValueError(f"DATA {out.data}")
 
 
-def _ascii(path: Path, header: _Header) -> dict[str, NDArray[np.generic]]:
+def _ascii(path: Path, header: _Header, size: int | None) -> Iterator[dict[str, NDArray[np.generic]]]:
     names = header.columns
     wanted = [k for k, name in enumerate(names) if "[" not in name]
-    table = read_table(path, header.lines, " ", names, wanted, wanted, header.points)
-    if len(table) < header.points:
-        raise ScanError(f"cut short: {len(table)} of {header.points} points", file=path)
-    return {names[k]: column for k, column in zip(wanted, table.T, strict=True)}
+    blocks = read_blocks(path, header.lines, " ", names, wanted, wanted, header.points)
+    seen = 0
+    for table in blocks if size else [np.concatenate([np.zeros((0, len(wanted))), *blocks])]:
+        seen += len(table)
+        yield {names[k]: column for k, column in zip(wanted, table.T, strict=True)}
+    if seen < header.points:
+        raise ScanError(f"cut short: {seen} of {header.points} points", file=path)
 
 
-def _binary(path: Path, header: _Header) -> dict[str, NDArray[np.generic]]:
+def _binary(path: Path, header: _Header, size: int | None) -> Iterator[dict[str, NDArray[np.generic]]]:
     kind = np.dtype(
         [(f"{k}", t, (c,)) for k, (t, c) in enumerate(zip(header.types, header.counts, strict=True))]
     )
-    have = max(path.stat().st_size - header.size, 0) // kind.itemsize
-    if have < header.points:
-        raise ScanError(f"cut short: {have} of {header.points} points", file=path)
-    table = np.fromfile(path, kind, header.points, offset=header.size)
-    return {name: table[f"{k}"][:, 0] for k, name in enumerate(header.names) if header.counts[k] == 1}
+    for table in packed_rows(path, kind, header.points, header.size, size, "points"):
+        yield {name: table[f"{k}"][:, 0] for k, name in enumerate(header.names) if header.counts[k] == 1}
 
 
 def _compressed(path: Path, header: _Header) -> dict[str, NDArray[np.generic]]:

@@ -6,8 +6,10 @@ and knows no viewpoint; hence a reader of our own.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +17,10 @@ from numpy.typing import NDArray
 from bimfit.errors import ScanError
 from bimfit.geometry.line_scan import LineScan
 from bimfit.geometry.pose import Array
-from bimfit.scan.cloud import PointCloud
-from bimfit.scan.formats.packed import cloud_of
-from bimfit.scan.formats.text import first_lines, read_table
+from bimfit.scan.cloud import PointCloud, joined_clouds
+from bimfit.scan.formats.options import ReadOptions
+from bimfit.scan.formats.packed import PIECE, clouds_of, packed_rows
+from bimfit.scan.formats.text import first_lines, read_blocks, read_table
 
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
@@ -58,6 +61,22 @@ def read_ply(path: Path) -> PointCloud:
     ScanError
         When it is no PLY file, is cut short, or has no vertices with x, y and z.
     """
+    return joined_clouds(list(_pieces(path, None)))
+
+
+def ply_chunks(path: Path, options: ReadOptions) -> Iterator[PointCloud]:
+    """Read the vertices of a PLY file in pieces.
+
+    Raises
+    ------
+    ScanError
+        As :func:`read_ply` does, at the latest after the last piece.
+    """
+    return _pieces(path, PIECE)
+
+
+def _pieces(path: Path, size: int | None) -> Iterator[PointCloud]:
+    """Clouds of ``size`` vertices each, or of all."""
     header = _header(path)
     vertex = next((e for e in header.elements if e.name == "vertex"), None)
     if vertex is None or not {"x", "y", "z"} <= set(vertex.names):
@@ -66,10 +85,10 @@ def read_ply(path: Path) -> PointCloud:
         raise ScanError("vertices with list properties are not supported", file=path)
     if not vertex.count:
         raise ScanError("the file holds no point", file=path)
-    columns = _ascii(path, header, vertex) if header.form == "ascii" else _binary(path, header, vertex)
     faces = sum(e.count for e in header.elements if e.name == "face")
     notes = (f"a mesh: its {vertex.count} vertices are read, its {faces} faces are not",) if faces else ()
-    return cloud_of(path, columns, _viewpoint(header.comments), notes)
+    read = _ascii if header.form == "ascii" else _binary
+    yield from clouds_of(path, read(path, header, vertex, size), _viewpoint(header.comments), notes)
 
 
 def write_ply(scan: LineScan | PointCloud, path: Path) -> None:
@@ -152,32 +171,38 @@ def _viewpoint(comments: list[str]) -> Array | None:
     return None
 
 
-def _ascii(path: Path, header: _Header, vertex: _Element) -> dict[str, NDArray[np.generic]]:
+def _ascii(
+    path: Path, header: _Header, vertex: _Element, size: int | None
+) -> Iterator[dict[str, NDArray[np.generic]]]:
     before = sum(e.count for e in header.elements[: header.elements.index(vertex)])
-    table = read_table(
-        path, header.lines + before, " ", vertex.names, range(len(vertex.names)),
-        range(len(vertex.names)), vertex.count,
-    )  # fmt: skip
-    if len(table) < vertex.count:
-        raise ScanError(f"cut short: {len(table)} of {vertex.count} vertices", file=path)
-    # What was a whole number in the file is one again (colours); coordinates are exact as printed.
-    return {
-        name: column.astype(kind) if kind[0] in "iu" else column
-        for name, kind, column in zip(vertex.names, vertex.types, table.T, strict=True)
-    }
+    every = range(len(vertex.names))
+    read = read_blocks if size else _whole
+    seen = 0
+    for table in read(path, header.lines + before, " ", vertex.names, every, every, vertex.count):
+        seen += len(table)
+        # What was a whole number in the file is one again (colours); coordinates are exact as printed.
+        yield {
+            name: column.astype(kind) if kind[0] in "iu" else column
+            for name, kind, column in zip(vertex.names, vertex.types, table.T, strict=True)
+        }
+    if seen < vertex.count:
+        raise ScanError(f"cut short: {seen} of {vertex.count} vertices", file=path)
 
 
-def _binary(path: Path, header: _Header, vertex: _Element) -> dict[str, NDArray[np.generic]]:
+def _whole(*args: Any) -> Iterator[Array]:
+    yield read_table(*args)
+
+
+def _binary(
+    path: Path, header: _Header, vertex: _Element, size: int | None
+) -> Iterator[dict[str, NDArray[np.generic]]]:
     order = _ORDER[header.form]
     start = header.size
     for element in header.elements[: header.elements.index(vertex)]:
         start += _length(path, start, element, order)
     kind = np.dtype([(f"{k}", order + t) for k, t in enumerate(vertex.types)])
-    have = max(path.stat().st_size - start, 0) // kind.itemsize
-    if have < vertex.count:
-        raise ScanError(f"cut short: {have} of {vertex.count} vertices", file=path)
-    table = np.fromfile(path, kind, vertex.count, offset=start)
-    return {name: table[f"{k}"].astype(kind[k].newbyteorder("=")) for k, name in enumerate(vertex.names)}
+    for table in packed_rows(path, kind, vertex.count, start, size, "vertices"):
+        yield {name: table[f"{k}"].astype(kind[k].newbyteorder("=")) for k, name in enumerate(vertex.names)}
 
 
 def _length(path: Path, start: int, element: _Element, order: str) -> int:

@@ -6,6 +6,7 @@ in its last row), then a line a point, column after column. A file may hold seve
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -15,7 +16,8 @@ import numpy as np
 from bimfit.errors import ScanError
 from bimfit.geometry.line_scan import LineScan, joined
 from bimfit.geometry.pose import Array, transform_points
-from bimfit.scan.cloud import PointCloud, usable
+from bimfit.scan.cloud import PointCloud, joined_clouds, usable
+from bimfit.scan.formats.options import ReadOptions
 from bimfit.scan.formats.organised import beams_of
 from bimfit.scan.formats.text import read_table
 
@@ -34,8 +36,39 @@ def read_ptx(path: Path) -> LineScan | PointCloud:
     ScanError
         When a header does not hold together, a matrix is not rigid, or the file is cut short.
     """
-    scans: list[LineScan | None] = []
-    points: list[Array] = []
+    read = [(beams, cloud) for beams, cloud in _scans(path)]
+    if not sum(len(cloud) for _, cloud in read):
+        raise ScanError("the file holds no point", file=path)
+    whole = [beams for beams, _ in read if beams is not None]
+    if len(whole) == len(read):
+        return joined(whole, str(path))
+    return joined_clouds([cloud for _, cloud in read])
+
+
+def ptx_chunks(path: Path, options: ReadOptions) -> Iterator[LineScan | PointCloud]:
+    """Read a PTX file a scan at a time; as beams if the first scan's columns are sweeps, else as points.
+
+    Raises
+    ------
+    ScanError
+        As :func:`read_ptx` does, at the latest after the last scan.
+    """
+    as_beams: bool | None = None
+    seen = number = 0
+    for beams, cloud in _scans(path):
+        seen += len(cloud)
+        as_beams = beams is not None if as_beams is None else as_beams
+        if as_beams and beams is not None:
+            yield replace(beams, scan=beams.scan + number)
+            number += int(beams.scan.max()) + 1 if len(beams) else 0
+        else:
+            yield cloud
+    if not seen:
+        raise ScanError("the file holds no point", file=path)
+
+
+def _scans(path: Path) -> Iterator[tuple[LineScan | None, PointCloud]]:
+    """Every scan in world coordinates, as beams where it can be, and as points."""
     skip = 0
     while (head := _lines(path, skip)) and head[0].strip():
         columns, rows, T = _header(path, head, skip)
@@ -49,15 +82,11 @@ def read_ptx(path: Path) -> LineScan | PointCloud:
         table[~usable(table) | (table == 0.0).all(axis=1)] = np.nan
         grid = table.reshape(columns, rows, 3)
         beams = beams_of(grid, np.zeros(3), str(path), np.dtype(np.float64))
-        scans.append(None if beams is None else beams.transformed(T))
-        points.append(transform_points(T, table[np.isfinite(table).all(axis=1)]))
+        points = transform_points(T, table[np.isfinite(table).all(axis=1)])
+        # where the columns are no sweeps, the scanner did not stand where the header has it
+        eye = None if beams is None else T[:3, 3].copy()
+        yield None if beams is None else beams.transformed(T), PointCloud(points, eye, source=str(path))
         skip += _HEADER + columns * rows
-    if not sum(map(len, points)):
-        raise ScanError("the file holds no point", file=path)
-    whole = [scan for scan in scans if scan is not None]
-    if len(whole) == len(scans):
-        return joined(whole, str(path))
-    return replace(PointCloud(np.concatenate(points)), source=str(path))
 
 
 def _lines(path: Path, skip: int, count: int = _HEADER) -> list[str]:

@@ -74,14 +74,27 @@ def read_table(
     ScanError
         Naming line and column of the first cell that is no number, or the first row of another length.
     """
-    parts, line = [], skip + 1
+    parts = list(read_blocks(path, skip, delimiter, names, wanted, may_be_empty, rows))
+    return np.concatenate(parts) if parts else np.zeros((0, len(wanted)))
+
+
+def read_blocks(
+    path: Path,
+    skip: int,
+    delimiter: str,
+    names: Sequence[str],
+    wanted: Sequence[int],
+    may_be_empty: Sequence[int] = (),
+    rows: int | None = None,
+) -> Iterator[Array]:
+    """The same as :func:`read_table`, some tens of megabytes of text at a time."""
+    line = skip + 1
     with path.open("rb") as stream:
         for _ in range(skip):
             stream.readline()
         for block in _first(_whole_lines(stream), rows):
-            parts.append(_parse(path, block, line, delimiter, names, list(wanted), set(may_be_empty)))
+            yield _parse(path, block, line, delimiter, names, list(wanted), set(may_be_empty))
             line += block.count(b"\n")
-    return np.concatenate(parts) if parts else np.zeros((0, len(wanted)))
 
 
 def _whole_lines(stream: BinaryIO) -> Iterator[bytes]:

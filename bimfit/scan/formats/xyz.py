@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from bimfit.errors import ScanError
 from bimfit.geometry.line_scan import LineScan
+from bimfit.geometry.pose import Array
 from bimfit.scan.cloud import PointCloud, usable
 from bimfit.scan.formats.delimited import BEAM, read_csv
-from bimfit.scan.formats.text import first_lines, read_table
+from bimfit.scan.formats.options import ReadOptions
+from bimfit.scan.formats.text import first_lines, read_blocks
 
 _MOST_HEADER = 20
 
@@ -27,20 +30,55 @@ def read_xyz(path: Path) -> LineScan | PointCloud:
     ScanError
         Naming the line of the first row that is not such a row.
     """
+    lines = _head(path)
+    if _is_line_scan(lines):
+        return read_csv(path)
+    pieces = list(_pieces(path, lines))
+    table = np.concatenate(pieces)
+    if not usable(table[:, :3]).any():
+        raise ScanError("the file holds no point", file=path)
+    return _cloud(path, table)
+
+
+def xyz_chunks(path: Path, options: ReadOptions) -> Iterator[LineScan | PointCloud]:
+    """Read plain text points in pieces; a text file with the header of a line scan is one piece.
+
+    Raises
+    ------
+    ScanError
+        As :func:`read_xyz` does, at the latest after the last piece.
+    """
+    lines = _head(path)
+    if _is_line_scan(lines):
+        yield read_csv(path)
+        return
+    seen = 0
+    for table in _pieces(path, lines):
+        piece = _cloud(path, table)
+        seen += len(piece)
+        yield piece
+    if not seen:
+        raise ScanError("the file holds no point", file=path)
+
+
+def _head(path: Path) -> list[str]:
     head = first_lines(path)
     if b"\0" in head:
         raise ScanError("not a text file", file=path)
-    lines = head.decode("utf-8-sig", errors="replace").split("\n")
-    if _is_line_scan(lines):
-        return read_csv(path)
+    return head.decode("utf-8-sig", errors="replace").split("\n")
+
+
+def _pieces(path: Path, lines: list[str]) -> Iterator[Array]:
     skip, delimiter, width = _layout(path, lines)
     names = ["x", "y", "z", *(f"{k + 1}" for k in range(3, width))]
-    table = read_table(path, skip, delimiter, names, range(width), range(width))
+    return read_blocks(path, skip, delimiter, names, range(width), range(width))
+
+
+def _cloud(path: Path, table: Array) -> PointCloud:
+    width = table.shape[1]
     finite = usable(table[:, :3])
-    if not finite.any():
-        raise ScanError("the file holds no point", file=path)
-    lost = int((~finite).sum())
-    table = table[finite]
+    lost = not finite.all()
+    table = table[finite] if lost else table
     rest = table[:, 3:]
     intensity = rest[:, 0].copy() if width in (4, 7) else None
     triple = rest[:, -3:] if width in (6, 7) else None
@@ -53,7 +91,7 @@ def read_xyz(path: Path) -> LineScan | PointCloud:
         colors=triple.astype(np.uint8) if triple is not None and colors else None,
         intensity=intensity,
         source=str(path),
-        notes=(f"{lost} rows without coordinates left out",) if lost else (),
+        notes=(f"{int(np.count_nonzero(~finite))} rows without coordinates left out",) if lost else (),
     )
 
 
