@@ -13,7 +13,7 @@ def jit(function: Callable[..., Any]) -> Callable[..., Any]:
 
     Division by zero gives inf or NaN as in NumPy, instead of an exception from inside a kernel.
     """
-    return _compiled(function, fastmath=False)
+    return _compiled(function)
 
 
 def jit_fast(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -26,8 +26,18 @@ def jit_sums(function: Callable[..., Any]) -> Callable[..., Any]:
     return _compiled(function, fastmath={"reassoc", "contract"})
 
 
-def _compiled(function: Callable[..., Any], *, fastmath: bool | set[str]) -> Callable[..., Any]:
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": fastmath}
+def jit_inner(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same for a part of another kernel's hot loop: compiled into it, since a call's arrays cost more."""
+    return _compiled(function, forceinline=True)
+
+
+def jit_inner_fast(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Both."""
+    return _compiled(function, forceinline=True, fastmath=True)
+
+
+def _compiled(function: Callable[..., Any], **more: bool | set[str]) -> Callable[..., Any]:
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": False, **more}
     try:
         compiled: Callable[..., Any] = nb.njit(cache=True, **options)(function)
     except RuntimeError:  # numba found no directory for its cache: a read-only installation

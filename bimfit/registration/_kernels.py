@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from bimfit._kernels import jit
+from bimfit._kernels import jit, jit_inner, jit_inner_fast
+from bimfit.registration._kernels_table import FULL, LANE, RIM
 
-FULL = 255  # leaf value on the model itself
-LANE = 21  # bits of one of three sums that share a machine word
 LANE_SUM = (1 << LANE) - 1
 NOTHING = -(1 << 40)  # score of no pose at all
 SHIFT_NODE = 20  # bits of one index in a node's code
+RUN = 512  # points whose sums are kept in single precision
+ROUNDING = 2.0**-14  # such a sum's greatest error, as a share of its terms' magnitudes: RUN 2^-24, and to spare
 
 # slots of the state vector
 HEAP, BEST, BEST_CODE, EVALUATIONS, PHASE, FOUND, BOUND = 0, 1, 2, 3, 4, 5, 6
@@ -25,184 +26,67 @@ STATE_SIZE = 32
 DONE, TOLERANCE, BUDGET, HEAP_FULL, FOUND_FULL = 0, 1, 2, 3, 4
 
 
-# ---------------------------------------------------------------- tables
-
-
-@jit
-def raster(edges, sigma, ou, ov, qu, qv, height, width):
-    """Leaf table: round(255 exp(-d^2 / 2 sigma^2)), d from a cell's centre to the nearest edge."""
-    out = np.zeros((height, width), np.uint8)
-    reach = sigma * np.sqrt(2.0 * np.log(2.0 * FULL)) * 1.0001
-    for e in range(edges.shape[0]):
-        au, av = edges[e, 0, 0], edges[e, 0, 1]
-        du, dv = edges[e, 1, 0] - au, edges[e, 1, 1] - av
-        size = du * du + dv * dv
-        i0 = max(0, int(np.floor((min(av, av + dv) - reach - ov) / qv)))
-        i1 = min(height - 1, int(np.floor((max(av, av + dv) + reach - ov) / qv)))
-        j0 = max(0, int(np.floor((min(au, au + du) - reach - ou) / qu)))
-        j1 = min(width - 1, int(np.floor((max(au, au + du) + reach - ou) / qu)))
-        for i in range(i0, i1 + 1):
-            pv = ov + (i + 0.5) * qv - av
-            for j in range(j0, j1 + 1):
-                pu = ou + (j + 0.5) * qu - au
-                t = 0.0
-                if size > 0.0:
-                    t = min(1.0, max(0.0, (pu * du + pv * dv) / size))
-                xu, xv = pu - t * du, pv - t * dv
-                value = np.uint8(np.floor(FULL * np.exp(-(xu * xu + xv * xv) / (2.0 * sigma * sigma)) + 0.5))
-                if value > out[i, j]:
-                    out[i, j] = value
-    return out
-
-
-@jit
-def lane_table(leaf):
-    """Three neighbours along u in one word, for cells -1 .. H in v and -3 .. W in u; zero at the rim."""
-    height, width = leaf.shape
-    out = np.zeros((height + 2, width + 4), np.uint64)
-    for i in range(height):
-        for j in range(-2, width):
-            word = np.uint64(0)
-            for m in range(3):
-                if 0 <= j + m < width:
-                    word |= np.uint64(leaf[i, j + m]) << np.uint64(LANE * m)
-            out[i + 1, j + 3] = word
-    return out
-
-
-@jit
-def block_table(leaf, bu, bv, slack, low_u, low_v, out):
-    """Overlapped block maxima: out[b] = max of leaf over b B - slack .. (b + 2) B - 2 + slack an axis."""
-    height, width = leaf.shape
-    rows, columns = out.shape
-    part = np.zeros((height, columns), np.uint8)
-    for i in range(height):
-        for b in range(columns):
-            first = max(0, (b + low_u) * bu - slack)
-            last = min(width - 1, (b + low_u + 2) * bu - 2 + slack)
-            top = np.uint8(0)
-            for j in range(first, last + 1):
-                top = max(top, leaf[i, j])
-            part[i, b] = top
-    for b in range(rows):
-        first = max(0, (b + low_v) * bv - slack)
-        last = min(height - 1, (b + low_v + 2) * bv - 2 + slack)
-        for j in range(columns):
-            top = np.uint8(0)
-            for i in range(first, last + 1):
-                top = max(top, part[i, j])
-            out[b, j] = top
-
-
-@jit
-def affine_table(leaf, ru, rv, pad, shift, out):
-    """Affine majorants: leaf[c + d] 2^shift <= A + gu du + gv dv for |du| <= ru, |dv| <= rv.
-
-    The slope is the window's least-squares slope times the one of a few factors that gives the least A.
-    ``out`` (H + 2 pad, W + 2 pad) packs A (16 bits), gu + 128 and gv + 128 (8 bits each).
-    """
-    rows, columns = out.shape
-    height, width = leaf.shape
-    nu, nv = 2 * ru + 1, 2 * rv + 1
-    one = np.int32(1 << shift)
-    wide = np.zeros((rows + 2 * rv, columns + 2 * ru), np.int32)
-    wide[rv + pad : rv + pad + height, ru + pad : ru + pad + width] = leaf
-    scale_u = one * 3.0 / (max(1, ru * (ru + 1)) * nu * nv)
-    scale_v = one * 3.0 / (max(1, rv * (rv + 1)) * nu * nv)
-    empty = (np.uint32(128) << np.uint32(16)) | (np.uint32(128) << np.uint32(24))
-    for y in range(rows):
-        for x in range(columns):
-            sum_u, sum_v, top = np.int32(0), np.int32(0), np.int32(0)
-            for a in range(nv):
-                row = wide[y + a, x : x + nu]
-                line = np.int32(0)
-                for b in range(nu):
-                    line = np.int32(line + row[b])
-                    sum_u = np.int32(sum_u + np.int32(row[b] * np.int32(b - ru)))
-                    top = max(top, row[b])
-                sum_v = np.int32(sum_v + np.int32(line * np.int32(a - rv)))
-            if top == 0:
-                out[y, x] = empty
-                continue
-            best_a, best_u, best_v = np.int32(top * one), np.int32(0), np.int32(0)
-            for f in range(2, 6):
-                gu = np.int32(min(127, max(-127, int(np.rint(0.25 * f * scale_u * sum_u)))))
-                gv = np.int32(min(127, max(-127, int(np.rint(0.25 * f * scale_v * sum_v)))))
-                if gu == 0 and gv == 0:
-                    continue
-                least = np.int32(-(1 << 30))
-                for a in range(nv):
-                    row = wide[y + a, x : x + nu]
-                    rest = np.int32(gv * np.int32(a - rv))
-                    for b in range(nu):
-                        value = np.int32(np.int32(row[b] * one) - np.int32(gu * np.int32(b - ru)))
-                        least = max(least, np.int32(value - rest))
-                if least < best_a:
-                    best_a, best_u, best_v = least, gu, gv
-            word = np.uint32(best_a) | (np.uint32(best_u + 128) << np.uint32(16))
-            out[y, x] = word | (np.uint32(best_v + 128) << np.uint32(24))
-
-
 # ---------------------------------------------------------------- cells and leaves
 
 
-@jit
-def fill_cells(cosine, sine, pu, pv, start, cu, cv):
-    """Cells of all points at one angle and translation 0; ``pu``, ``pv`` in cells about the pivot.
+@jit_inner
+def fill_cells(base, n, cosine, sine, pu, pv, start, cu, cv):
+    """Cells of all points at one angle and translation 0, from ``base`` on.
 
-    ``start`` holds the pivot's cell coordinates and the ratio of the cells' sides.
+    ``pu``, ``pv``: points about the pivot, in cells; ``start``: the pivot's cell coordinates and the ratio of
+    the cells' sides.
     """
     a, b = sine * start[2], sine * start[3]
-    for k in range(pu.shape[0]):
-        cu[k] = np.int32(np.floor(cosine * pu[k] - a * pv[k] + start[0]))
-        cv[k] = np.int32(np.floor(b * pu[k] + cosine * pv[k] + start[1]))
+    for k in range(n):
+        cu[np.uint64(base + k)] = np.int32(np.floor(cosine * pu[k] - a * pv[k] + start[0]))
+        cv[np.uint64(base + k)] = np.int32(np.floor(b * pu[k] + cosine * pv[k] + start[1]))
 
 
-@jit
-def score_box(base, n, cu, cv, weight, chunk, lanes, v0, nv, u0, nu, at, out):
-    """Scores of nv x nu neighbouring translations at one angle, three along u in each word."""
-    height, width = lanes.shape
-    table = lanes.reshape(height * width)
-    own_u, own_v, cells = cu[base : base + n], cv[base : base + n], at[:n]
-    right, low, stride = np.int32(width - 1), np.int32(height - 1), np.int32(width)
-    words = (nu + 2) // 3
+@jit_inner
+def score_box(base, n, cu, cv, weight, chunk, lanes, v0, nv, u0, nu, at, out, to):
+    """Scores of nv x nu neighbouring translations at one angle into ``out`` from ``to`` on.
+
+    Cells of the ``n`` points lie at ``base`` and on. Three scores along u share each word of ``lanes``.
+    """
+    stride = np.int32(lanes.shape[1])
+    right, low = np.int32(lanes.shape[1] - 1), np.int32(lanes.shape[0] - 1)
+    table = lanes.reshape(lanes.size)
     for i in range(nv):
         shift_v = np.int32(v0 + i + 1)
-        for m in range(words):
-            left = 3 * m
+        for left in range(0, nu, 3):
             shift_u = np.int32(u0 + left + 3)
             for p in range(n):
-                x = min(max(np.int32(own_u[p] + shift_u), np.int32(0)), right)
-                y = min(max(np.int32(own_v[p] + shift_v), np.int32(0)), low)
-                cells[p] = np.int32(np.int32(y * stride) + x)
+                x = min(max(np.int32(cu[np.uint64(base + p)] + shift_u), np.int32(0)), right)
+                y = min(max(np.int32(cv[np.uint64(base + p)] + shift_v), np.int32(0)), low)
+                at[p] = np.int32(np.int32(y * stride) + x)
             s0, s1, s2 = np.int64(0), np.int64(0), np.int64(0)
             k = 0
             while k < n:
                 stop = min(n, k + chunk)
                 word = np.uint64(0)
                 for p in range(k, stop):
-                    word += table[np.uint64(cells[p])] * weight[p]
+                    word += table[np.uint64(at[np.uint64(p)])] * weight[np.uint64(p)]
                 s0 += np.int64(word & np.uint64(LANE_SUM))
                 s1 += np.int64((word >> np.uint64(LANE)) & np.uint64(LANE_SUM))
                 s2 += np.int64(word >> np.uint64(2 * LANE))
                 k = stop
-            out[i * nu + left] = s0
+            out[to + i * nu + left] = s0
             if left + 1 < nu:
-                out[i * nu + left + 1] = s1
+                out[to + i * nu + left + 1] = s1
             if left + 2 < nu:
-                out[i * nu + left + 2] = s2
+                out[to + i * nu + left + 2] = s2
 
 
 # ---------------------------------------------------------------- heap
 
 
-@jit
+@jit_inner
 def before(ka, ca, kb, cb):
     """Whether entry a leaves the queue before b: greater key, then lesser code."""
     return ka > kb or (ka == kb and ca < cb)
 
 
-@jit
+@jit_inner
 def heap_push(keys, codes, size, key, code):
     """Add an entry to a heap of ``size``."""
     i = size
@@ -215,7 +99,7 @@ def heap_push(keys, codes, size, key, code):
     keys[i], codes[i] = key, code
 
 
-@jit
+@jit_inner
 def heap_pop(keys, codes, size):
     """Remove the first entry of a heap of ``size``; what is left has ``size - 1``."""
     last = size - 1
@@ -237,76 +121,77 @@ def heap_pop(keys, codes, size):
 # ---------------------------------------------------------------- search
 
 
-@jit
+@jit_inner
 def pack(t, v, u):
     """One code for three indices; codes compare lexicographically as (theta, v, u)."""
     return (np.int64(t) << (2 * SHIFT_NODE)) | (np.int64(v) << SHIFT_NODE) | np.int64(u)
 
 
-@jit
+@jit_inner
 def keeps(bound, code, cut, cut_code):
     """Whether a node may hold a leaf that beats the incumbent, ties in lexicographic order."""
     return bound > cut or (bound == cut and code < cut_code)
 
 
-@jit
+@jit_inner
 def ensure_cells(it, n, pu, pv, cosine, sine, start, cu, cv, have):
     """Compute the cells at angle ``it`` unless they are there."""
     if have[it] == 0:
-        own = slice(it * n, it * n + n)
-        fill_cells(cosine[it], sine[it], pu, pv, start, cu[own], cv[own])
+        fill_cells(it * n, n, cosine[it], sine[it], pu, pv, start, cu, cv)
         have[it] = 1
 
 
-@jit
-def merge_blocks(cu, cv, weight, classes, bu, bv, at, lists, counts, slot):
+@jit_inner
+def merge_blocks(base, n, cu, cv, weight, own, classes, bu, bv, at, lists, counts, slot):
     """Blocks that the points fall into at one (level, angle), neighbours merged; kept in ``lists``.
 
-    Rows of ``lists``: block in u, block in v, slack class, weight. Dividing by multiplication is exact
-    here: a cell's middle is half a cell from any border, far above rounding.
+    Cells of the points lie at ``base`` and on, their classes at ``own`` and on. Rows of ``lists``: block in
+    u, block in v, slack class, weight. Dividing by multiplication is exact here: a cell's middle is half a
+    cell from any border, far above rounding.
     """
-    n = cu.shape[0]
     first = slot * n
     inverse_u, inverse_v = 1.0 / bu, 1.0 / bv
     for k in range(n):
-        at[k] = np.int32(np.floor((cu[k] + 0.5) * inverse_u))
-        at[n + k] = np.int32(np.floor((cv[k] + 0.5) * inverse_v))
+        at[k] = np.int32(np.floor((cu[np.uint64(base + k)] + 0.5) * inverse_u))
+        at[np.uint64(n + k)] = np.int32(np.floor((cv[np.uint64(base + k)] + 0.5) * inverse_v))
     m = first - 1
     last_u, last_v, last_c = np.int32(0), np.int32(0), np.int32(-1)
     for k in range(n):
-        x, y, c = at[np.uint64(k)], at[np.uint64(n + k)], np.int32(classes[k])
+        if weight[k] == 0:
+            continue
+        x, y, c = at[k], at[np.uint64(n + k)], np.int32(classes[np.uint64(own + k)])
         if x == last_u and y == last_v and c == last_c:
-            lists[3, m] += np.int32(weight[k])
+            lists[3, np.uint64(m)] += np.int32(weight[k])
         else:
             m += 1
-            lists[0, m], lists[1, m], lists[2, m], lists[3, m] = x, y, c, np.int32(weight[k])
+            i = np.uint64(m)
+            lists[0, i], lists[1, i], lists[2, i], lists[3, i] = x, y, c, np.int32(weight[k])
             last_u, last_v, last_c = x, y, c
     counts[slot] = m - first + 1
 
 
-@jit
-def bound_box(slot, n, lists, counts, blocks, place, v0, nv, u0, nu, tally, out):
-    """Block bounds of nv x nu neighbouring nodes at one (level, angle); ``tally`` is scratch.
+@jit_inner
+def bound_box(slot, n, lists, counts, blocks, place, level, v0, nv, u0, nu, tally):
+    """Block bounds of nv x nu neighbouring nodes at one (level, angle) into rows of ``tally``.
 
-    ``place`` (classes, 5): offset into ``blocks``, rows, columns, lowest block in u and v.
+    ``place`` (levels, classes, 5): offset into ``blocks``, rows, columns, lowest block in u and v. Rows of
+    ``tally`` are nu + RIM long, those of ``blocks`` end in RIM zeros: both are gone through in whole vectors.
     """
-    tally[: nv * nu] = 0
+    stride = nu + RIM
+    for k in range(nv * stride):
+        tally[k] = np.int32(0)
     for m in range(slot * n, slot * n + counts[slot]):
-        where = place[lists[2, m]]
+        c = lists[2, m]
         weight = lists[3, m]
-        x = np.int64(lists[0, m]) + u0 - where[3]
-        y = np.int64(lists[1, m]) + v0 - where[4]
-        i0, i1 = max(0, -y), min(nv, where[1] - y)
-        j0, j1 = max(0, -x), min(nu, where[2] - x)
-        if j0 >= j1:
-            continue
-        for i in range(i0, i1):
-            line = where[0] + (y + i) * where[2] + x
-            row, sums = blocks[line + j0 : line + j1], tally[i * nu + j0 : i * nu + j1]
-            for j in range(row.shape[0]):
-                sums[j] = np.int32(sums[j] + np.int32(weight * np.int32(row[j])))
-    for i in range(nv * nu):
-        out[i] = tally[i]
+        rows, columns = place[level, c, 1], place[level, c, 2]
+        x = np.int64(lists[0, m]) + u0 - place[level, c, 3]
+        y = np.int64(lists[1, m]) + v0 - place[level, c, 4]
+        j0, j1 = max(0, -x), min(nu, columns - x)
+        for i in range(max(0, -y), min(nv, rows - y)):
+            line, sums = place[level, c, 0] + (y + i) * (columns + RIM) + x + j0, i * stride + j0
+            for k in range((j1 - j0 + RIM - 1) // RIM * RIM):
+                step = np.int32(weight * np.int32(blocks[np.uint64(line + k)]))
+                tally[np.uint64(sums + k)] = np.int32(tally[np.uint64(sums + k)] + step)
 
 
 @jit
@@ -327,74 +212,216 @@ def point_classes(n, pu, pv, qu, qv, eta, class_of, out):
             out[level * n + k] = class_of[level, min(slack, last)]
 
 
-@jit
-def affine_classes(first, middle, bt, n, cu, cv, class_of, at, out):
-    """Slack class of every point at one (level, angle) from the cells at the interval's very angles."""
-    last = class_of.shape[0] - 1
-    mu, mv = cu[middle * n : middle * n + n], cv[middle * n : middle * n + n]
-    most = at[:n]
-    most[:] = 0
-    for i in range(first, first + bt):
-        ou, ov = cu[i * n : i * n + n], cv[i * n : i * n + n]
-        for k in range(n):
-            a, b = np.int32(ou[k] - mu[k]), np.int32(ov[k] - mv[k])
-            most[k] = max(most[k], a, np.int32(-a), b, np.int32(-b))
-    for k in range(n):
-        out[k] = class_of[np.uint64(min(most[k], last))]
+@jit_inner
+def turn_classes(first, middle, bt, n, cu, cv, class_of, level, at, own, out):
+    """Slack class of every point at one (level, angle) from the cells at the interval's very angles.
 
-
-@jit
-def affine_pass(cu, cv, classes, weight, du, dv, where, tables, at, gu, gv, sums):
-    """Sum of majorants at one pose: constants and slopes into ``sums``, weighted slopes a point kept.
-
-    All arrays run over the points; ``where``: offset into ``tables``, rows, columns, rim. Three
-    loops, so that all but the look-ups become vector code.
+    They go into ``out`` from ``own`` on.
     """
-    offset, rows, columns, pad = where[0], where[1], where[2], where[3]
-    right, low, stride = np.int32(columns - 1), np.int32(rows - 1), np.int32(rows * columns)
-    shift_u, shift_v, width = np.int32(du + pad), np.int32(dv + pad), np.int32(columns)
-    for k in range(cu.shape[0]):
-        x = min(max(np.int32(cu[k] + shift_u), np.int32(0)), right)
-        y = min(max(np.int32(cv[k] + shift_v), np.int32(0)), low)
-        at[k] = np.int32(np.int32(np.int32(y * width) + x) + np.int32(np.int32(classes[k]) * stride))
-    for k in range(cu.shape[0]):
-        at[k] = np.int32(tables[np.uint64(offset + at[k])])
-    total, total_u, total_v = np.int64(0), np.int32(0), np.int32(0)
-    for k in range(cu.shape[0]):
-        word, w = at[k], np.int32(weight[k])
-        a = np.int32(w * np.int32(np.int32(np.int32(word >> np.int32(16)) & np.int32(255)) - np.int32(128)))
-        b = np.int32(w * np.int32(np.int32(np.int32(word >> np.int32(24)) & np.int32(255)) - np.int32(128)))
-        total += np.int64(np.int32(w * np.int32(word & np.int32(65535))))
-        total_u = np.int32(total_u + a)
-        total_v = np.int32(total_v + b)
-        gu[k] = a
-        gv[k] = b
-    sums[0], sums[1], sums[2] = total, total_u, total_v
+    for k in range(n):
+        at[k] = np.int32(0)
+    for i in range(first, first + bt):
+        if i == middle:
+            continue
+        for k in range(n):
+            a = np.int32(cu[np.uint64(i * n + k)] - cu[np.uint64(middle * n + k)])
+            b = np.int32(cv[np.uint64(i * n + k)] - cv[np.uint64(middle * n + k)])
+            at[k] = max(at[k], a, np.int32(-a), b, np.int32(-b))
+    last = np.int32(class_of.shape[1] - 1)
+    for k in range(n):
+        out[np.uint64(own + k)] = class_of[level, np.uint64(min(at[k], last))]
 
 
-@jit
-def turn_gain(cu, cv, other_u, other_v, gu, gv):
-    """Sum of slope times cells moved between two angles."""
-    total = np.int32(0)
-    for k in range(cu.shape[0]):
-        a = np.int32(gu[k] * np.int32(other_u[k] - cu[k]))
-        b = np.int32(gv[k] * np.int32(other_v[k] - cv[k]))
-        total = np.int32(total + np.int32(a + b))
-    return np.int64(total)
+@jit_inner_fast
+def quad_pass(
+    m, base, cu, cv, own, classes, k0, heft, du, dv, where, unit, level, quads, at, words, halves, coef,
+    sums,
+):  # fmt: skip
+    """Sum of ``m`` points' quadratic majorants at one pose.
+
+    Points ``k0`` and on, their cells at ``base`` and on, their slack classes at ``own`` and on.
+
+    ``heft``: the points' weights; ``halves``: the low and high halves of ``words``. Each point's quadratic is moved to the cell that the point lies in. Slopes (u, v) and curvatures (uu, uv,
+    vv) a point are kept, weighted, in five stretches of ``coef``; ``sums``: constant, slopes and curvatures
+    are added to. Three loops, so that all but the look-ups becomes vector code.
+    """
+    offset, rows, columns = where[level, 0], where[level, 1], where[level, 2]
+    right, low = np.int32((columns << where[level, 3]) - 1), np.int32((rows << where[level, 4]) - 1)
+    stride, width = np.int32(rows * columns), np.int32(columns)
+    shift_u, shift_v = np.int32(du + where[level, 5]), np.int32(dv + where[level, 6])
+    # a record's cells along an axis are a power of two, so these products are exact
+    many_u, many_v = np.float32(1 << where[level, 3]), np.float32(1 << where[level, 4])
+    less_u, less_v = np.float32(1.0) / many_u, np.float32(1.0) / many_v
+    mid_u, mid_v = np.float32((1 << where[level, 3]) >> 1), np.float32((1 << where[level, 4]) >> 1)
+    unit_g, unit_h = np.float32(unit[level, 0]), np.float32(unit[level, 1])
+    for k in range(m):
+        x = min(max(np.int32(cu[np.uint64(base + k)] + shift_u), np.int32(0)), right)
+        y = min(max(np.int32(cv[np.uint64(base + k)] + shift_v), np.int32(0)), low)
+        line = np.int32(np.int32(np.float32(y) * less_v) * width)
+        at[k] = np.int32(np.int32(line + np.int32(np.float32(x) * less_u)) + np.int32(np.int32(classes[np.uint64(own + k)]) * stride))
+    for k in range(m):
+        words[k] = quads[np.uint64(offset + at[k])]
+    two, zero_g, zero_h = np.float32(2.0), np.float32(2048.0), np.float32(128.0)
+    t0, t1, t2 = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    t3, t4, t5 = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    for k in range(m):
+        x = np.float32(min(max(np.int32(cu[np.uint64(base + k)] + shift_u), np.int32(0)), right))
+        y = np.float32(min(max(np.int32(cv[np.uint64(base + k)] + shift_v), np.int32(0)), low))
+        ou = x - many_u * np.float32(np.int32(x * less_u)) - mid_u
+        ov = y - many_v * np.float32(np.int32(y * less_v)) - mid_v
+        one, other = halves[2 * k], halves[2 * k + 1]
+        w = heft[np.uint64(k0 + k)]
+        wg, wh = w * unit_g, w * unit_h
+        gu = wg * (np.float32(np.int32(other & np.int32(0xFFF))) - zero_g)
+        gv = wg * (np.float32(np.int32(np.int32(other >> np.int32(12)) & np.int32(0xFFF))) - zero_g)
+        bu = wh * (np.float32(np.int32(np.int32(one >> np.int32(16)) & np.int32(0xFF))) - zero_h)
+        bv = wh * (np.float32(np.int32(np.int32(one >> np.int32(24)) & np.int32(0xFF))) - zero_h)
+        twist = wh * (np.float32(np.int32(np.int32(other >> np.int32(24)) & np.int32(0xFF))) - zero_h)
+        a, b, c = bu * ou, twist * ov, bv * ov
+        t0 += w * np.float32(np.int32(one & np.int32(0xFFFF))) + ou * (gu + a + b) + ov * (gv + c)
+        gu += two * a + b
+        gv += two * c + twist * ou
+        t1 += gu
+        t2 += gv
+        t3 += bu
+        t4 += twist
+        t5 += bv
+        coef[k] = gu
+        coef[RUN + k] = gv
+        coef[2 * RUN + k] = bu
+        coef[3 * RUN + k] = twist
+        coef[4 * RUN + k] = bv
+    sums[0] += t0
+    sums[1] += t1
+    sums[2] += t2
+    sums[3] += t3
+    sums[4] += t4
+    sums[5] += t5
+
+
+@jit_inner_fast
+def turn_gain(m, base, other, cu, cv, coef, out, i):
+    """What moving ``m`` points from their cells at ``base`` to those at ``other`` adds to constant and slopes."""
+    two = np.float32(2.0)
+    t0, t1, t2 = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    for k in range(m):
+        u = np.float32(np.int32(cu[np.uint64(other + k)] - cu[np.uint64(base + k)]))
+        v = np.float32(np.int32(cv[np.uint64(other + k)] - cv[np.uint64(base + k)]))
+        b = coef[3 * RUN + k]
+        a, c = coef[2 * RUN + k] * u, coef[4 * RUN + k] * v
+        t0 += u * (coef[k] + a + b * v) + v * (coef[RUN + k] + c)
+        t1 += two * a + b * v
+        t2 += two * c + b * u
+    out[3 * i] += t0
+    out[3 * i + 1] += t1
+    out[3 * i + 2] += t2
+
+
+@jit_inner
+def arch(slope, bend, half):
+    """Greatest slope x + bend x^2 for |x| <= half."""
+    if bend < 0.0 and abs(slope) < -2.0 * bend * half:
+        return -0.25 * slope * slope / bend
+    return abs(slope) * half + bend * half * half
+
+
+@jit_inner
+def quad_node(
+    n, first, middle, bt, du, dv, cu, cv, own, classes, heft, where, unit, level, quads, at, words, halves, coef,
+    sums, turns,
+):  # fmt: skip
+    """Quadratic of a node's bound: ``sums`` at its middle, ``turns`` (3 an angle) what each angle adds.
+
+    Points go by in runs of ``RUN``, so that single precision loses no more than ``ROUNDING`` allows for.
+    """
+    for i in range(6):
+        sums[i] = 0.0
+    for i in range(3 * bt):
+        turns[i] = 0.0
+    for k in range(0, n, RUN):
+        m, base = min(RUN, n - k), middle * n + k
+        quad_pass(
+            m, base, cu, cv, own + k, classes, k, heft, du, dv, where, unit, level, quads, at, words, halves,
+            coef, sums,
+        )  # fmt: skip
+        for i in range(bt):
+            if first + i != middle:
+                turn_gain(m, base, (first + i) * n + k, cu, cv, coef, turns, i)
+
+
+@jit_inner
+def quad_children(size, level, sums, turns, scale, margin, cut, out):
+    """Bounds of all children (theta, v, u) of a node; NOTHING for those seen to lie under ``cut``.
+
+    ``size`` (levels, 3): leaves an axis (u, v, theta) in a node of each level. A child's bound is the
+    greatest of its angles', each the quadratic's greatest value over the child's box.
+    """
+    bu, bv, bt = size[level, 0], size[level, 1], size[level, 2]
+    lu, lv, lt = size[level - 1, 0], size[level - 1, 1], size[level - 1, 2]
+    fu, fv, ft = bu // lu, bv // lv, bt // lt
+    huu, huv, hvv = sums[3], sums[4], sums[5]
+    half_u, half_v = float(bu // 2), float(bv // 2)
+    rest_u, rest_v = 0.5 * (lu - 1), 0.5 * (lv - 1)
+    cross, cross_all = abs(huv) * rest_u * rest_v, abs(huv) * half_u * half_v
+    for a in range(ft):
+        for k in range(a * fv * fu, (a + 1) * fv * fu):
+            out[k] = NOTHING
+        for i in range(a * lt, (a + 1) * lt):
+            steady = sums[0] + turns[3 * i]
+            gu, gv = sums[1] + turns[3 * i + 1], sums[2] + turns[3 * i + 2]
+            most = steady + arch(gu, huu, half_u) + arch(gv, hvv, half_v) + cross_all
+            if most * scale + margin < cut:
+                continue
+            for b in range(fv):
+                y = b * lv + rest_v - half_v
+                line = steady + y * (gv + hvv * y) + cross
+                slope_u, slope_v = gu + huv * y, gv + 2.0 * hvv * y
+                for c in range(fu):
+                    x = c * lu + rest_u - half_u
+                    value = line + x * (slope_u + huu * x)
+                    if rest_u > 0.0:
+                        value += arch(slope_u + 2.0 * huu * x, huu, rest_u)
+                    if rest_v > 0.0:
+                        value += arch(slope_v + huv * x, hvv, rest_v)
+                    at = (a * fv + b) * fu + c
+                    out[at] = max(out[at], np.int64(np.floor(value * scale + margin)))
+
+
+@jit_inner
+def log_prior(prior, prior_at, level, t, v, u):
+    """Log-prior of one node of a level, or of one leaf (level 0)."""
+    return prior[prior_at[level, 2] + t] + prior[prior_at[level, 1] + v] + prior[prior_at[level, 0] + u]
+
+
+@jit_inner
+def block_bounds(
+    level, t, v0, nv, u0, nu, n, pu, pv, weight, start, cosine, sine, size, blocks, place, classes, slots, cu,
+    cv, have, lists, list_counts, at, tally,
+):  # fmt: skip
+    """Block bounds of nv x nu nodes of one level and angle into rows of ``tally``; caches what it works out."""
+    middle = t * size[level, 2] + size[level, 2] // 2
+    ensure_cells(middle, n, pu, pv, cosine, sine, start, cu, cv, have)
+    slot = slots[level] + t
+    if list_counts[slot] < 0:
+        merge_blocks(
+            middle * n, n, cu, cv, weight, level * n, classes, size[level, 0], size[level, 1], at, lists, list_counts,
+            slot,
+        )  # fmt: skip
+    bound_box(slot, n, lists, list_counts, blocks, place, level, v0, nv, u0, nu, tally)
 
 
 @jit
 def search(
-    options, pu, pv, weight, start, cosine, sine, size, count, lanes, blocks, place, affine, affine_place,
-    class_of, classes, slots, prior, prior_at, cu, cv, have, lists, list_counts, near, near_have, at, gu, gv,
-    tally, box, root, keys, codes, found_codes, found_scores, state,
+    options, pu, pv, weight, heft, start, cosine, sine, size, count, lanes, blocks, place, quads, quad_place,
+    quad_scale, class_of, classes, slots, prior, prior_at, cu, cv, have, lists, list_counts, near, near_have,
+    at, words, halves, coef, tally, box, root, keys, codes, found_codes, found_scores, state,
 ):  # fmt: skip
     """Best-first branch and bound over (theta, v, u); resumable, see ``grcsm.py`` for the arguments."""
     n, first, top = options[0], options[1], options[2]
     chunk, limit, slice_limit = options[3], options[4], options[5]
-    collect, floor_score, has_prior = options[6], options[7], options[8]
-    sums = np.empty(3, np.int64)
-    turns = np.empty(max(1, size[top, 2]), np.int64) if affine.shape[0] > 1 else np.empty(1, np.int64)
+    collect, floor_score, has_prior, total = options[6], options[7], options[8], options[9]
+    sums = np.empty(6)
+    turns = np.empty(3 * size[top, 2] if quads.shape[0] > 1 else 3)
     n_heap, cut, cut_code = state[HEAP], state[BEST], state[BEST_CODE]
     evaluations, n_found = state[EVALUATIONS], state[FOUND]
     started = evaluations
@@ -402,37 +429,43 @@ def search(
         cut, cut_code = floor_score - 1, np.int64(0)
     diving = False
     level, t, v, u, bound = np.int64(0), np.int64(0), np.int64(0), np.int64(0), np.int64(0)
+    nt, nv, nu = count[first, 2], count[first, 1], count[first, 0]
 
     if state[PHASE] == 0:
         # every node of the first level, then a greedy dive from the best of them
-        nt, nv, nu = count[first, 2], count[first, 1], count[first, 0]
         best_root, best_at = -(np.int64(1) << 60), np.int64(0)
         for it in range(nt):
+            stride = nu
             if first == 0:
                 ensure_cells(it, n, pu, pv, cosine, sine, start, cu, cv, have)
-                score_box(it * n, n, cu, cv, weight, chunk, lanes, 0, nv, 0, nu, at, box)
+                score_box(it * n, n, cu, cv, weight, chunk, lanes, 0, nv, 0, nu, at, box, 0)
             else:
-                middle = it * size[first, 2] + size[first, 2] // 2
-                ensure_cells(middle, n, pu, pv, cosine, sine, start, cu, cv, have)
-                slot = slots[first] + it
-                if list_counts[slot] < 0:
-                    own = slice(middle * n, middle * n + n)
-                    merge_blocks(
-                        cu[own], cv[own], weight, classes[first * n : first * n + n], size[first, 0],
-                        size[first, 1], at, lists, list_counts, slot,
-                    )  # fmt: skip
-                bound_box(slot, n, lists, list_counts, blocks, place[first], 0, nv, 0, nu, tally, box)
-            for i in range(nv * nu):
-                value = box[i]
+                stride = nu + RIM
+                block_bounds(
+                    first, it, 0, nv, 0, nu, n, pu, pv, weight, start, cosine, sine, size, blocks, place, classes,
+                    slots, cu, cv, have, lists, list_counts, at, tally,
+                )  # fmt: skip
+            for b in range(nv):
+                row, line = (it * nv + b) * nu, b * stride
+                most = -(np.int64(1) << 60)
                 if has_prior:
-                    value += (
-                        prior[prior_at[first, 2] + it]
-                        + prior[prior_at[first, 1] + i // nu]
-                        + prior[prior_at[first, 0] + i % nu]
-                    )
-                root[it * nv * nu + i] = value
-                if value > best_root:
-                    best_root, best_at = value, it * nv * nu + i
+                    for c in range(nu):
+                        value = np.int64(tally[line + c]) if first > 0 else box[line + c]
+                        value += log_prior(prior, prior_at, first, it, b, c)
+                        root[row + c] = value
+                        most = max(most, value)
+                elif first > 0:
+                    for c in range(nu):
+                        root[np.uint64(row + c)] = tally[np.uint64(line + c)]
+                        most = max(most, np.int64(tally[np.uint64(line + c)]))
+                else:
+                    for c in range(nu):
+                        root[np.uint64(row + c)] = box[np.uint64(line + c)]
+                        most = max(most, box[np.uint64(line + c)])
+                if most > best_root:
+                    best_root, best_at = most, row
+                    while root[best_at] < most:
+                        best_at += 1
         evaluations += nt * nv * nu
         state[PHASE] = 1
         if first == 0:
@@ -457,20 +490,19 @@ def search(
             if state[PHASE] == 1:
                 # the incumbent is known: queue what can still beat it
                 if first > 0:
-                    nt, nv, nu = count[first, 2], count[first, 1], count[first, 0]
                     if keys.shape[0] < n_heap + nt * nv * nu:
                         stop = HEAP_FULL
                         break
-                    bu, bv, bt = size[first, 0], size[first, 1], size[first, 2]
-                    for it in range(nt):
-                        for i in range(nv * nu):
-                            value = root[it * nv * nu + i]
-                            if value < cut:
-                                continue
-                            code = pack(it * bt, (i // nu) * bv, (i % nu) * bu)
-                            if keeps(value, code, cut, cut_code):
-                                heap_push(keys, codes, n_heap, (value << 6) | (63 - first), code)
-                                n_heap += 1
+                    for i in range(nt * nv * nu):
+                        value = root[i]
+                        if value < cut:
+                            continue
+                        code = pack(
+                            i // (nv * nu) * size[first, 2], (i // nu) % nv * size[first, 1], i % nu * size[first, 0]
+                        )
+                        if keeps(value, code, cut, cut_code):
+                            heap_push(keys, codes, n_heap, (value << 6) | (63 - first), code)
+                            n_heap += 1
                 state[PHASE] = 2
             if n_heap == 0:
                 break
@@ -485,19 +517,18 @@ def search(
             if not collect and start[4] > 0.0 and bound - cut <= start[4] * cut:
                 stop = TOLERANCE
                 break
-            if evaluations >= limit:
-                stop = BUDGET
-                break
-            if evaluations - started >= slice_limit:
+            if evaluations >= limit or evaluations - started >= slice_limit:
                 stop = BUDGET
                 break
             level = 63 - (keys[0] & 63)
             t = (code >> (2 * SHIFT_NODE)) // size[level, 2]
             v = ((code >> SHIFT_NODE) & ((1 << SHIFT_NODE) - 1)) // size[level, 1]
             u = (code & ((1 << SHIFT_NODE) - 1)) // size[level, 0]
-            bt, bv, bu = size[level, 2], size[level, 1], size[level, 0]
-            lt, lv, lu = size[level - 1, 2], size[level - 1, 1], size[level - 1, 0]
-            children = (bt // lt) * (bv // lv) * (bu // lu)
+            children = (
+                (size[level, 2] // size[level - 1, 2])
+                * (size[level, 1] // size[level - 1, 1])
+                * (size[level, 0] // size[level - 1, 0])
+            )
             if keys.shape[0] < n_heap + children:
                 stop = HEAP_FULL
                 break
@@ -511,126 +542,67 @@ def search(
         ft, fv, fu = bt // lt, bv // lv, bu // lu
         state[EXPANDED + level] += 1
         t0, v0, u0 = t * bt, v * bv, u * bu  # the node's first leaf
-        shift = affine_place[level, 4]
-        majorant = shift >= 0
-        steady, slope_u, slope_v, most_u, most_v = (
-            np.int64(0),
-            np.int64(0),
-            np.int64(0),
-            np.int64(0),
-            np.int64(0),
-        )
+        majorant = quad_place[level, 0] >= 0
         if majorant:
             middle = t0 + bt // 2
             for i in range(t0, t0 + bt):
                 if have[i] == 0:
                     ensure_cells(i, n, pu, pv, cosine, sine, start, cu, cv, have)
             flag = slots[level] + t
-            class_base = affine_place[level, 5] * n
+            own = quad_place[level, 7] * n + t * n
             if near_have[flag] == 0:
-                near_at = class_base + t * n
-                affine_classes(t0, middle, bt, n, cu, cv, class_of[level], at, near[near_at : near_at + n])
+                turn_classes(t0, middle, bt, n, cu, cv, class_of, level, at, own, near)
                 near_have[flag] = 1
-            here = slice(middle * n, middle * n + n)
-            mu, mv = cu[here], cv[here]
-            affine_pass(
-                mu, mv, near[(class_base + t * n) : (class_base + t * n + n)], weight, u0 + bu // 2,
-                v0 + bv // 2, affine_place[level], affine, at[:n], gu[:n], gv[:n], sums,
+            quad_node(
+                n, t0, middle, bt, u0 + bu // 2, v0 + bv // 2, cu, cv, own, near, heft,
+                quad_place, quad_scale, level, quads, at, words, halves, coef, sums, turns,
             )  # fmt: skip
-            for i in range(bt):
-                if t0 + i == middle:
-                    turns[i] = 0
-                else:
-                    there = slice((t0 + i) * n, (t0 + i) * n + n)
-                    turns[i] = turn_gain(mu, mv, cu[there], cv[there], gu[:n], gv[:n])
-            steady, slope_u, slope_v = sums[0], sums[1], sums[2]
-            # the most that the slopes add within the node, whichever child
-            most_u = max(-slope_u * (bu // 2), slope_u * (bu - 1 - bu // 2))
-            most_v = max(-slope_v * (bv // 2), slope_v * (bv - 1 - bv // 2))
+            margin = 1e-6 + ROUNDING * quad_scale[level, 3] * total
+            quad_children(size, level, sums, turns, quad_scale[level, 2], margin, cut, box)
+            evaluations += ft * fv * fu
         best_child, best_key = np.int64(-1), -(np.int64(1) << 60)
         next_t, next_v, next_u = np.int64(0), np.int64(0), np.int64(0)
         for a in range(ft):
             ct = t0 // lt + a
-            turn = np.int64(0)
-            if majorant:
-                turn = turns[a * lt]
-                for i in range(1, lt):
-                    turn = max(turn, turns[a * lt + i])
+            if level > 1 and not majorant:
+                block_bounds(
+                    level - 1, ct, v0 // lv, fv, u0 // lu, fu, n, pu, pv, weight, start, cosine, sine, size, blocks,
+                    place, classes, slots, cu, cv, have, lists, list_counts, at, tally,
+                )  # fmt: skip
                 evaluations += fv * fu
-                if (steady + turn + most_u + most_v) >> shift < cut:
-                    continue  # a log-prior is never positive, so it cannot save the angle
+            elif level == 1 and not majorant:
+                ensure_cells(ct, n, pu, pv, cosine, sine, start, cu, cv, have)
+            for b in range(fv):
+                line = (a * fv + b) * fu
+                if level > 1 and not majorant:
+                    for c in range(fu):
+                        box[line + c] = tally[b * (fu + RIM) + c]
                 if level == 1:
                     # score the rows that hold a leaf whose bound beats the incumbent
-                    for b in range(fv):
-                        line = box[b * fu : (b + 1) * fu]
-                        worth = False
-                        high = steady + turn + slope_v * (b - bv // 2)
-                        if (high + most_u) >> shift < cut:
-                            line[:] = NOTHING
-                            continue
+                    worth = not majorant
+                    if majorant:
                         for c in range(fu):
-                            value = (high + slope_u * (c - bu // 2)) >> shift
+                            value = box[line + c]
+                            if value < cut:
+                                continue
                             if has_prior:
-                                value += (
-                                    prior[prior_at[0, 2] + ct]
-                                    + prior[prior_at[0, 1] + v0 + b]
-                                    + prior[prior_at[0, 0] + u0 + c]
-                                )
+                                value += log_prior(prior, prior_at, 0, ct, v0 + b, u0 + c)
                             worth = worth or keeps(min(value, bound), pack(ct, v0 + b, u0 + c), cut, cut_code)
-                        if worth:
-                            state[EXPANDED] += 1
-                            evaluations += fu
-                            score_box(ct * n, n, cu, cv, weight, chunk, lanes, v0 + b, 1, u0, fu, at, line)
-                        else:
-                            line[:] = NOTHING
-            elif level > 1:
-                middle = ct * lt + lt // 2
-                ensure_cells(middle, n, pu, pv, cosine, sine, start, cu, cv, have)
-                slot = slots[level - 1] + ct
-                if list_counts[slot] < 0:
-                    own = slice(middle * n, middle * n + n)
-                    merge_blocks(
-                        cu[own], cv[own], weight, classes[(level - 1) * n : level * n], lu, lv, at, lists,
-                        list_counts, slot,
-                    )  # fmt: skip
-                bound_box(
-                    slot,
-                    n,
-                    lists,
-                    list_counts,
-                    blocks,
-                    place[level - 1],
-                    v0 // lv,
-                    fv,
-                    u0 // lu,
-                    fu,
-                    tally,
-                    box,
-                )
-                evaluations += fv * fu
-            if level == 1 and not majorant:
-                ensure_cells(ct, n, pu, pv, cosine, sine, start, cu, cv, have)
-                score_box(ct * n, n, cu, cv, weight, chunk, lanes, v0, fv, u0, fu, at, box)
-                evaluations += fv * fu
-            for b in range(fv):
+                    if not worth:
+                        continue
+                    state[EXPANDED] += 1
+                    evaluations += fu
+                    score_box(ct * n, n, cu, cv, weight, chunk, lanes, v0 + b, 1, u0, fu, at, box, line)
                 for c in range(fu):
-                    if majorant and level > 1:
-                        lo, hi = b * lv - bv // 2, (b + 1) * lv - 1 - bv // 2
-                        value = steady + turn + max(slope_v * lo, slope_v * hi)
-                        lo, hi = c * lu - bu // 2, (c + 1) * lu - 1 - bu // 2
-                        value = (value + max(slope_u * lo, slope_u * hi)) >> shift
-                    else:
-                        value = box[b * fu + c]
+                    value = box[line + c]
+                    if value < cut:
+                        continue  # a log-prior is never positive
                     if has_prior:
-                        value += (
-                            prior[prior_at[level - 1, 2] + ct]
-                            + prior[prior_at[level - 1, 1] + v0 // lv + b]
-                            + prior[prior_at[level - 1, 0] + u0 // lu + c]
-                        )
+                        value += log_prior(prior, prior_at, level - 1, ct, v0 // lv + b, u0 // lu + c)
                     code = pack(ct * lt, v0 + b * lv, u0 + c * lu)
                     if level == 1:
                         if collect:
-                            if value > cut and value > NOTHING // 2:
+                            if value > cut:
                                 found_codes[n_found], found_scores[n_found] = code, value
                                 n_found += 1
                         elif keeps(value, code, cut, cut_code):
@@ -671,9 +643,9 @@ def brute(n, pu, pv, weight, chunk, start, cosine, sine, count, lanes, prior, pr
     box = np.empty(nu, np.int64)
     best, best_code = np.int64(-(1 << 60)), np.int64(0)
     for t in range(nt):
-        fill_cells(cosine[t], sine[t], pu, pv, start, cu, cv)
+        fill_cells(0, n, cosine[t], sine[t], pu, pv, start, cu, cv)
         for v in range(nv):
-            score_box(0, n, cu, cv, weight, chunk, lanes, v, 1, 0, nu, at, box)
+            score_box(0, n, cu, cv, weight, chunk, lanes, v, 1, 0, nu, at, box, 0)
             for u in range(nu):
                 value = box[u]
                 if has_prior:
@@ -756,7 +728,7 @@ def printed(
 
 
 @jit
-def prepare(points, motion, box, shift, swing, scale_u, scale_v, given, pu, pv, weight, out):
+def prepare(points, motion, box, shift, swing, scale_u, scale_v, given, pu, pv, weight, heft, out):
     """Carry points by ``motion`` (cos, sin, u, v), choose the pivot, drop what can never meet the model.
 
     ``box`` (low u, low v, high u, high v) holds the model and its blur; ``shift`` and ``swing`` are the
@@ -786,8 +758,11 @@ def prepare(points, motion, box, shift, swing, scale_u, scale_v, given, pu, pv, 
         if np.sqrt(off_u * off_u + off_v * off_v) <= shift + swing * radius + 1e-9:
             pu[m], pv[m] = (u - pivot_u) * scale_u, (v - pivot_v) * scale_v
             weight[m] = given[k] if given.shape[0] > 0 else np.uint64(1)
+            heft[m] = np.float32(weight[m])
             reach = max(reach, radius)
             m += 1
+    for k in range(m, pu.shape[0]):
+        pu[k], pv[k], weight[k], heft[k] = 0.0, 0.0, np.uint64(0), np.float32(0.0)
     out[0], out[1], out[2], out[3] = pivot_u, pivot_v, reach, m
 
 

@@ -20,6 +20,7 @@ from bimfit.registration.result import Stop
 from bimfit.registration.table import BLUR_REACH, Tables, Target
 
 MIN_POINTS = 3
+PAD = 32  # points are filled up to a multiple of this with points of no weight: whole vectors
 WEIGHT_STEPS = 255  # unequal weights are rounded to this many steps of the greatest, or fewer
 MOST_WEIGHT = 300_000  # steps of all points together that the kernels' 32 bits hold
 ROOT_COST = 300_000.0  # look-ups that bounding the whole first level may cost
@@ -40,7 +41,8 @@ class Problem:
         The data turn about it, m.
     pu, pv : ndarray, shape (n,)
         Points about the pivot, in cells.
-    weight : ndarray of uint64, shape (n,)
+    weight, heft : ndarray of uint64 and of float32, shape (n,)
+        Weights in steps, as the scores and as the quadratic bounds need them.
     unit : float
         Score that one step of weight times table value stands for.
     start : ndarray, shape (5,)
@@ -52,6 +54,7 @@ class Problem:
     pu: Array
     pv: Array
     weight: NDArray[np.uint64]
+    heft: NDArray[np.float32]
     unit: float
     start: Array
     rounding: float
@@ -94,11 +97,13 @@ def pose_problem(
     back = prior.inverse()
     motion = np.array([math.cos(back.theta), math.sin(back.theta), back.u, back.v])
     step_u, step_v = lattice.step[0], lattice.step[1]
-    pu, pv, weight, out = np.empty(n), np.empty(n), np.empty(n, np.uint64), np.empty(4)
+    padded = n + PAD
+    pu, pv, weight, out = np.empty(padded), np.empty(padded), np.empty(padded, np.uint64), np.empty(4)
+    heft = np.empty(padded, np.float32)
     kernels.prepare(
         points, motion, box, math.hypot(lattice.half[0], lattice.half[1]),
         2.0 * math.sin(0.5 * min(lattice.half[2], math.pi)), 1.0 / step_u, 1.0 / step_v, given, pu, pv,
-        weight, out,
+        weight, heft, out,
     )  # fmt: skip
     kept = int(out[3])
     if kept < MIN_POINTS:
@@ -113,7 +118,8 @@ def pose_problem(
             config.eps,
         ]
     )
-    return Problem(tables, out[:2], pu[:kept], pv[:kept], weight[:kept], unit, start, rounding)
+    kept = -(-kept // PAD) * PAD
+    return Problem(tables, out[:2], pu[:kept], pv[:kept], weight[:kept], heft[:kept], unit, start, rounding)
 
 
 def _weights(weights: ArrayLike | None, n: int) -> tuple[NDArray[np.uint64], float, float]:
@@ -163,6 +169,7 @@ class Plan:
     half_angle: Array
     slot_count: int
     near: int
+    tally: int
     capacity: int
 
     @classmethod
@@ -170,14 +177,17 @@ class Plan:
         """Choose the first level and count what the workspace must hold."""
         lattice = tables.lattice
         top, nodes, size = lattice.top, lattice.nodes, lattice.size
-        affine = np.flatnonzero(tables.affine_place[:, 4] >= 0)
-        first = first_level(lattice, capacity, int(affine.max(initial=1)))
+        quads = np.flatnonzero(tables.quad_place[:, 0] >= 0)
+        first = first_level(lattice, capacity, int(quads.max(initial=1)))
         fan = max((int((size[h] // size[h - 1]).prod()) for h in range(1, top + 1)), default=1)
         ends = np.cumsum(nodes[:, 2])
+        rows, columns = int(nodes[first, 1]), int(nodes[first, 0]) + kernels.RIM
+        split = [(size[h] // size[h - 1])[:2] for h in range(1, top + 1)]
+        tally = max([rows * columns, *(int(v) * (int(u) + kernels.RIM) for u, v in split)])
         slots = np.concatenate([[0], ends[:-1]]).astype(np.int64)
         return cls(
             first, int(nodes[first].prod()), fan, slots, lattice.half_angle, int(ends[-1]),
-            int(nodes[affine, 2].sum()), capacity,
+            int(nodes[quads, 2].sum()), tally, capacity,
         )  # fmt: skip
 
 
@@ -193,9 +203,12 @@ class Workspace:
         self.list_counts = np.empty(plan.slot_count, np.int32)
         self.lists = np.empty((4, plan.slot_count * n), np.int32)
         self.near = np.empty(max(1, plan.near) * n, np.uint8)
-        self.at, self.gu, self.gv = (np.empty(2 * n, np.int32) for _ in range(3))
-        self.box = np.empty(max(wide, plan.fan) + 4, np.int64)
-        self.tally = np.empty(len(self.box), np.int32)
+        self.at = np.empty(2 * max(n, kernels.RUN), np.int32)
+        self.words = np.empty(kernels.RUN, np.uint64)
+        self.halves = self.words.view(np.int32)
+        self.coef = np.empty(5 * kernels.RUN, np.float32)
+        self.box = np.empty(max(wide, plan.fan), np.int64)
+        self.tally = np.empty(plan.tally, np.int32)
         self.root = np.empty(plan.roots, np.int64)
         self.keys = np.empty(plan.roots + (lattice.top + 2) * plan.fan + 1024, np.int64)
         self.codes = np.empty_like(self.keys)
@@ -278,15 +291,15 @@ def run(
     limit = config.max_evaluations if config.max_evaluations is not None else 1 << 60
     options = np.array(
         [n, plan.first, lattice.top, problem.chunk, limit, TIME_SLICE if deadline is not None else 1 << 60,
-         collect_from is not None, collect_from or 0, has_prior], np.int64,
+         collect_from is not None, collect_from or 0, has_prior, int(problem.weight.sum())], np.int64,
     )  # fmt: skip
     while True:
         ended = kernels.search(
-            options, problem.pu, problem.pv, problem.weight, problem.start, tables.cosine, tables.sine,
-            lattice.size, lattice.nodes, tables.lanes, tables.blocks, tables.block_place, tables.affine,
-            tables.affine_place, tables.class_of, work.classes, plan.slots, prior, prior_at, work.cu, work.cv,
-            work.have, work.lists, work.list_counts, work.near, work.near_have, work.at, work.gu, work.gv,
-            work.tally, work.box, work.root, work.keys, work.codes, work.found, work.values, state,
+            options, problem.pu, problem.pv, problem.weight, problem.heft, problem.start, tables.cosine, tables.sine,
+            lattice.size, lattice.nodes, tables.lanes, tables.blocks, tables.block_place, tables.quads,
+            tables.quad_place, tables.quad_scale, tables.class_of, work.classes, plan.slots, prior, prior_at,
+            work.cu, work.cv, work.have, work.lists, work.list_counts, work.near, work.near_have, work.at,
+            work.words, work.halves, work.coef, work.tally, work.box, work.root, work.keys, work.codes, work.found, work.values, state,
         )  # fmt: skip
         if ended == kernels.HEAP_FULL:
             work.grow("keys", "codes")
@@ -321,10 +334,10 @@ def _leaf_score(
     cu, cv, at = (np.empty(n, np.int32) for _ in range(3))
     out = np.empty(1, np.int64)
     kernels.fill_cells(
-        tables.cosine[index[2]], tables.sine[index[2]], problem.pu, problem.pv, problem.start, cu, cv
+        0, n, tables.cosine[index[2]], tables.sine[index[2]], problem.pu, problem.pv, problem.start, cu, cv
     )
     kernels.score_box(
-        0, n, cu, cv, problem.weight, problem.chunk, tables.lanes, index[1], 1, index[0], 1, at, out
+        0, n, cu, cv, problem.weight, problem.chunk, tables.lanes, index[1], 1, index[0], 1, at, out, 0
     )
     value = int(out[0])
     if has_prior:

@@ -15,12 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 from bimfit.config import Bound
 from bimfit.errors import ConfigError
 from bimfit.geometry.pose import Array
-from bimfit.registration import _kernels
+from bimfit.registration import _kernels_table as _kernels
 from bimfit.registration.lattice import Integers, Lattice
 
 MAX_CELLS = 1 << 26
 MAX_CLASSES = 6  # slack classes (rings) a level
-AFFINE_REACH = 24  # beyond this many cells a slope gains nothing over a plain maximum
+QUAD_REACH = 3.2  # widest block that a quadratic serves, in sigma; measured
+QUAD_SLACK = 6.0  # most slack by rotation in a level that has quadratics, in sigma
+QUAD_WINDOW = 3.0  # half a window beyond which a quadratic gains nothing over a plain maximum, in sigma
+GRAIN = 4.0  # half a block, in a record's cells; measured
 BLUR_REACH = math.sqrt(2.0 * math.log(2.0 * _kernels.FULL)) * 1.0001  # in sigma: farther, a cell holds 0
 
 
@@ -40,8 +43,10 @@ class Tables:
         ``leaf`` with three neighbours a word, for the kernels.
     blocks, block_place : ndarray
         Block maxima, flat, and where each level's and class's lie.
-    affine, affine_place : ndarray
-        Affine majorants, flat, and where each level's lie.
+    quads, quad_place, quad_scale : ndarray
+        Quadratic majorants, flat; where each level's lie (offset, rows, columns, log2 of the cells that a
+        record serves in u and v, rim in cells in u and v, angles of the levels below; -1 where a level has
+        none); and the units of slope and curvature, of a constant, and the greatest sum of a record's terms.
     class_of : ndarray of uint8, shape (levels, slacks)
         Slack class that serves so many cells of slack.
     reach : float
@@ -59,8 +64,9 @@ class Tables:
     lanes: NDArray[np.uint64]
     blocks: NDArray[np.uint8]
     block_place: Integers
-    affine: NDArray[np.uint32]
-    affine_place: Integers
+    quads: NDArray[np.uint64]
+    quad_place: Integers
+    quad_scale: Array
     class_of: NDArray[np.uint8]
     reach: float
     cosine: Array
@@ -70,7 +76,7 @@ class Tables:
     @property
     def nbytes(self) -> int:
         """Memory of all tables, bytes."""
-        parts = (self.leaf, self.lanes, self.blocks, self.affine, self.class_of, self.cosine, self.sine)
+        parts = (self.leaf, self.lanes, self.blocks, self.quads, self.class_of, self.cosine, self.sine)
         return int(sum(part.nbytes for part in parts))
 
 
@@ -112,17 +118,18 @@ def tables_of_leaf(
     reach: float,
 ) -> Tables:
     """Bounds of every level over any leaf table; ``sigma``: blur in cells of the finer and coarser axis."""
-    class_of = _classes(lattice, min(lattice.step[:2]), reach)
+    slacks = _slacks(lattice, min(lattice.step[:2]), reach)
+    class_of = _classes(slacks)
     if bound == "block":
         blocks, block_place = _printed_blocks(leaf, origin, lattice)
     else:
-        blocks, block_place = _overlapped_blocks(leaf, lattice, class_of)
-    majorant = _majorant_levels(lattice, sigma[1]) if bound == "majorant" else ()
-    affine, affine_place = _affine(leaf, lattice, class_of, majorant, sigma[0])
+        blocks, block_place = _overlapped_blocks(leaf, lattice, slacks)
+    majorant = _majorant_levels(lattice, slacks, sigma[1]) if bound == "majorant" else ()
+    quads, quad_place, quad_scale = _quads(leaf, lattice, slacks, majorant, sigma[0])
     angles = lattice.angles
     return Tables(
-        lattice, bound, origin, leaf, _kernels.lane_table(leaf), blocks, block_place, affine, affine_place,
-        class_of, reach, np.cos(angles), np.sin(angles), 0.0,
+        lattice, bound, origin, leaf, _kernels.lane_table(leaf), blocks, block_place, quads, quad_place,
+        quad_scale, class_of, reach, np.cos(angles), np.sin(angles), 0.0,
     )  # fmt: skip
 
 
@@ -143,9 +150,8 @@ def _leaf(edges: Array, blur: float, cell: Array, half: Array) -> tuple[NDArray[
     return table, origin
 
 
-def _classes(lattice: Lattice, cell: float, reach: float) -> NDArray[np.uint8]:
-    """Which of at most six slack classes serves how many cells of slack, per level."""
-    slacks = _slacks(lattice, cell, reach)
+def _classes(slacks: list[Integers]) -> NDArray[np.uint8]:
+    """Which of a level's slack classes serves how many cells of slack, shape (levels, slacks)."""
     longest = max(int(s[-1]) for s in slacks)
     out = np.zeros((len(slacks), longest + 1), np.uint8)
     for level, levels in enumerate(slacks):
@@ -154,6 +160,7 @@ def _classes(lattice: Lattice, cell: float, reach: float) -> NDArray[np.uint8]:
 
 
 def _slacks(lattice: Lattice, cell: float, reach: float) -> list[Integers]:
+    """Cells of slack that each of a level's at most six classes provides for, up to a point at ``reach``."""
     out = []
     for eta in lattice.half_angle:
         most = math.ceil(2.0 * reach * math.sin(0.5 * min(eta, math.pi)) / cell + 1e-9) if eta > 0.0 else 0
@@ -166,24 +173,21 @@ def _slacks(lattice: Lattice, cell: float, reach: float) -> list[Integers]:
     return out
 
 
-def _class_slack(class_of: NDArray[np.uint8], level: int) -> list[int]:
-    """Cells of slack that each class of a level provides for."""
-    row = class_of[level]
-    return [int(np.flatnonzero(row == c)[-1]) for c in range(int(row.max()) + 1)]
+def _majorant_levels(lattice: Lattice, slacks: list[Integers], sigma: float) -> tuple[int, ...]:
+    """Levels whose nodes are split by quadratic majorants: the fine ones, whose blocks lie within the blur.
 
-
-def _majorant_levels(lattice: Lattice, sigma: float) -> tuple[int, ...]:
-    """Levels whose nodes are split by affine majorants: at most the two finest, within the blur.
-
-    Beyond, a block spans so much of the surface that a slope gains nothing over a plain maximum.
+    Beyond, a block spans so much of the surface that a quadratic gains nothing over a plain maximum.
     """
-    reach = {1: 8.0, 2: 3.2}  # widest block, in sigma; measured
     widest = lattice.size[:, :2].max(axis=1)
-    return tuple(h for h in range(1, min(lattice.top, 2) + 1) if float(widest[h]) <= reach[h] * sigma)
+    return tuple(
+        h
+        for h in range(1, lattice.top + 1)
+        if float(widest[h]) <= QUAD_REACH * sigma and float(slacks[h][-1]) <= QUAD_SLACK * sigma
+    )
 
 
 def _overlapped_blocks(
-    leaf: NDArray[np.uint8], lattice: Lattice, class_of: NDArray[np.uint8]
+    leaf: NDArray[np.uint8], lattice: Lattice, slacks: list[Integers]
 ) -> tuple[NDArray[np.uint8], Integers]:
     height, width = leaf.shape
     place = np.zeros((lattice.top + 1, MAX_CLASSES, 5), np.int64)
@@ -191,11 +195,11 @@ def _overlapped_blocks(
     offset = 0
     for level in range(1, lattice.top + 1):
         bu, bv = int(lattice.size[level, 0]), int(lattice.size[level, 1])
-        for c, slack in enumerate(_class_slack(class_of, level)):
+        for c, slack in enumerate(slacks[level].tolist()):
             low_u, low_v = -((2 * bu - 2 + slack) // bu), -((2 * bv - 2 + slack) // bv)
             columns = (width - 1 + slack) // bu - low_u + 1
             rows = (height - 1 + slack) // bv - low_v + 1
-            out = np.zeros((rows, columns), np.uint8)
+            out = np.zeros((rows, columns + _kernels.RIM), np.uint8)
             _kernels.block_table(leaf, bu, bv, slack, low_u, low_v, out)
             place[level, c] = offset, rows, columns, low_u, low_v
             parts.append(out.ravel())
@@ -233,44 +237,61 @@ def aligned(origin: Array, lattice: Lattice) -> Integers:
     return np.asarray(np.rint(cells), np.int64)
 
 
-def _affine(
+def _quads(
     leaf: NDArray[np.uint8],
     lattice: Lattice,
-    class_of: NDArray[np.uint8],
+    slacks: list[Integers],
     levels: tuple[int, ...],
     sigma: float,
-) -> tuple[NDArray[np.uint32], Integers]:
+) -> tuple[NDArray[np.uint64], Integers, Array]:
     height, width = leaf.shape
-    place = np.full((lattice.top + 1, 6), -1, np.int64)
-    parts: list[NDArray[np.uint32]] = []
+    place = np.full((lattice.top + 1, 8), -1, np.int64)
+    scales = np.zeros((lattice.top + 1, 4))
+    parts: list[NDArray[np.uint64]] = []
     offset, angles = 0, 0
-    # steepest slope of a Gaussian: 255 exp(-1/2) / sigma a cell, to be held in 7 bits and a sign
-    shift = int(np.clip(math.floor(math.log2(127.0 * sigma / (_kernels.FULL * math.exp(-0.5)))), 0, 5))
+    steps, unit_g, unit_h = _units(sigma)
     for level in levels:
-        slacks = _class_slack(class_of, level)
+        own = slacks[level].tolist()
         ru, rv = int(lattice.size[level, 0]) // 2, int(lattice.size[level, 1]) // 2
-        pad = max(ru, rv) + slacks[-1] + 1
-        rows, columns = height + 2 * pad, width + 2 * pad
-        place[level] = offset, rows, columns, pad, shift, angles
+        eu, ev = _grain(ru), _grain(rv)
+        most_u, most_v = ru + own[-1] + (1 << eu), rv + own[-1] + (1 << ev)
+        rim_u, rim_v = (most_u >> eu) + 1, (most_v >> ev) + 1
+        columns, rows = rim_u + 1 - (-(width + most_u) >> eu), rim_v + 1 - (-(height + most_v) >> ev)
+        place[level] = offset, rows, columns, eu, ev, rim_u << eu, rim_v << ev, angles
         angles += int(lattice.nodes[level, 2])
-        for slack in slacks:
-            out = np.empty((rows, columns), np.uint32)
-            if max(ru, rv) + slack <= AFFINE_REACH:
-                _kernels.affine_table(leaf, ru + slack, rv + slack, pad, shift, out)
+        most = 0.0
+        for slack in own:
+            out = np.empty((rows, columns), np.uint64)
+            if max(ru, rv) + slack > QUAD_WINDOW * sigma:
+                peak = _kernels.FULL * steps
+                _kernels.flat_table(leaf, ru + slack, rv + slack, eu, ev, rim_u, rim_v, steps, out)
             else:
-                out[:] = _flat(leaf, ru + slack, rv + slack, pad, shift)
+                peak = _kernels.quad_table(
+                    leaf, ru + slack, rv + slack, eu, ev, rim_u, rim_v, steps, unit_g, unit_h, out
+                )
+            most = max(most, peak)
             parts.append(out.ravel())
             offset += out.size
-    return (np.concatenate(parts) if parts else np.zeros(1, np.uint32)), place
+        scales[level] = unit_g, unit_h, 1.0 / steps, most / steps
+    return (np.concatenate(parts) if parts else np.zeros(1, np.uint64)), place, scales
 
 
-def _flat(leaf: NDArray[np.uint8], ru: int, rv: int, pad: int, shift: int) -> NDArray[np.uint32]:
-    """Majorants of slope 0: the plain maximum."""
-    from scipy.ndimage import maximum_filter
+def _units(sigma: float) -> tuple[float, float, float]:
+    """Steps of a leaf's unit that a constant is held in, and units of slope and curvature in those steps.
 
-    padded = np.pad(leaf, pad)
-    top = maximum_filter(padded, size=(2 * rv + 1, 2 * ru + 1), mode="constant")
-    return (top.astype(np.uint32) << np.uint32(shift)) | np.uint32((128 << 16) | (128 << 24))
+    Powers of two, so that what is stored is exact in floating point. Sized for a Gaussian of ``sigma``
+    cells, whose steepest slope is 255 exp(-1/2) / sigma and whose greatest curvature 255 / (2 sigma^2).
+    """
+    steps = 2.0 ** min(7, max(0, math.floor(2.0 * math.log2(max(sigma, 1.0)))))
+    peak = _kernels.FULL * steps
+    slope = 1.1 * peak * math.exp(-0.5) / sigma / _kernels.MOST_G
+    bend = 1.1 * peak / (2.0 * sigma * sigma) / _kernels.MOST_H
+    return steps, 2.0 ** math.ceil(math.log2(slope)), 2.0 ** math.ceil(math.log2(bend))
+
+
+def _grain(radius: int) -> int:
+    """Log2 of the cells a record serves along an axis: about a quarter of the window that it must cover."""
+    return max(0, int(math.log2(max(1.0, radius / GRAIN))))
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from bimfit.config import SearchConfig
 from bimfit.registration import _kernels as kernels
+from bimfit.registration import _kernels_table as table_kernels
 from bimfit.registration import grcsm, table
 from bimfit.registration.lattice import Lattice
 from bimfit.registration.printed import run_brute, run_printed
@@ -32,7 +33,7 @@ def random_leaf(rng, kind, height, width):
     return out
 
 
-def random_problem(seed_, tests, levels, kind, bound, weighted):
+def random_problem(seed_, tests, levels, kind, bound, weighted, sigma=(0.5, 12.0)):
     rng = np.random.default_rng(seed_)
     half = tuple(float(0.5 * s**n) for s, n in zip(tests[:2], levels[:2], strict=True))  # cells of 1
     half_angle = float(rng.uniform(0.05, math.pi)) if rng.random() < 0.8 else math.pi
@@ -41,12 +42,13 @@ def random_problem(seed_, tests, levels, kind, bound, weighted):
     n = int(rng.integers(3, 25))
     points = rng.normal(0.0, 1.0, (n, 2)) * rng.uniform(1.0, 25.0)
     reach = float(np.hypot(*points.T).max())
-    sigma = float(rng.uniform(0.5, 12.0))
-    made = table.tables_of_leaf(leaf, -np.array(half), (sigma, sigma), lattice, bound, reach)
+    blur = float(rng.uniform(*sigma))
+    made = table.tables_of_leaf(leaf, -np.array(half), (blur, blur), lattice, bound, reach)
     weight = (rng.integers(0, 256, n) if weighted else np.ones(n)).astype(np.uint64)
     start = np.array([*rng.uniform(-10, 60, 2), 1.0, 1.0, 0.0])
     return grcsm.Problem(
-        made, np.zeros(2), points[:, 0].copy(), points[:, 1].copy(), weight, 1 / 255, start, 0.0
+        made, np.zeros(2), points[:, 0].copy(), points[:, 1].copy(), weight, weight.astype(np.float32),
+        1 / 255, start, 0.0,
     )
 
 
@@ -90,10 +92,17 @@ def test_the_search_equals_a_naive_maximum(bound, seed_, shape, kind, weighted):
     assert (brute.score, brute.index) == (found.score, found.index)
 
 
+def cells_at(problem, angle):
+    cu, cv = np.empty(problem.n, np.int32), np.empty(problem.n, np.int32)
+    c, s = problem.tables.cosine[angle], problem.tables.sine[angle]
+    kernels.fill_cells(0, problem.n, c, s, problem.pu, problem.pv, problem.start, cu, cv)
+    return cu, cv
+
+
 @seed(4)
 @QUICK
 @given(st.integers(0, 2**32 - 1), SHAPES, st.integers(0, 2), st.booleans())
-def test_no_node_holds_a_leaf_above_its_bound(seed_, shape, kind, weighted):
+def test_no_block_holds_a_leaf_above_its_bound(seed_, shape, kind, weighted):
     """Block bounds of every node of every level, from the tables and slack classes the search reads."""
     problem = random_problem(seed_, *shape, kind, "overlap", weighted)
     tables, lattice, n = problem.tables, problem.tables.lattice, problem.n
@@ -104,47 +113,99 @@ def test_no_node_holds_a_leaf_above_its_bound(seed_, shape, kind, weighted):
         bu, bv, bt = (int(x) for x in lattice.size[level])
         nu, nv, nt = (int(x) for x in lattice.nodes[level])
         most = scores.reshape(nt, bt, nv, bv, nu, bu).max(axis=(1, 3, 5))
+        at, tally = np.empty(2 * n, np.int32), np.empty(nv * (nu + table_kernels.RIM), np.int32)
         for t in range(nt):
-            cu, cv, at = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(2 * n, np.int32)
-            angle = t * bt + bt // 2
-            kernels.fill_cells(
-                tables.cosine[angle], tables.sine[angle], problem.pu, problem.pv, problem.start, cu, cv
-            )
-            lists, counts, out = (
-                np.empty((4, n), np.int32),
-                np.empty(1, np.int32),
-                np.empty(nv * nu, np.int64),
-            )
-            own = classes[level * n : level * n + n]
-            kernels.merge_blocks(cu, cv, problem.weight, own, bu, bv, at, lists, counts, 0)
-            tally, where = np.empty(nv * nu, np.int32), tables.block_place[level]
-            kernels.bound_box(0, n, lists, counts, tables.blocks, where, 0, nv, 0, nu, tally, out)
-            assert np.all(out.reshape(nv, nu) >= most[t])
+            cu, cv = cells_at(problem, t * bt + bt // 2)
+            lists, counts = np.empty((4, n), np.int32), np.empty(1, np.int32)
+            kernels.merge_blocks(
+                0, n, cu, cv, problem.weight, level * n, classes, bu, bv, at, lists, counts, 0
+            )  # fmt: skip
+            kernels.bound_box(
+                0, n, lists, counts, tables.blocks, tables.block_place, level, 0, nv, 0, nu, tally
+            )  # fmt: skip
+            assert np.all(tally.reshape(nv, -1)[:, :nu] >= most[t])
+
+
+@seed(10)
+@QUICK
+@given(st.integers(0, 2**32 - 1), SHAPES, st.integers(0, 2), st.booleans())
+def test_no_child_holds_a_leaf_above_its_quadratic_bound(seed_, shape, kind, weighted):
+    """Quadratic bounds of every child of random nodes of every level that has them."""
+    problem = random_problem(seed_, *shape, kind, "majorant", weighted, sigma=(3.0, 40.0))
+    tables, lattice, n = problem.tables, problem.tables.lattice, problem.n
+    scores = naive_scores(problem)
+    size, total = lattice.size, float(problem.weight.sum())
+    cu, cv = (np.concatenate(c) for c in zip(*[cells_at(problem, t) for t in range(lattice.count[2])]))
+    at, words = np.empty(2 * max(n, kernels.RUN), np.int32), np.empty(kernels.RUN, np.uint64)
+    coef, near = np.empty(5 * kernels.RUN, np.float32), np.empty(n, np.uint8)
+    for level in np.flatnonzero(tables.quad_place[:, 0] >= 0):
+        bu, bv, bt = (int(x) for x in size[level])
+        lu, lv, lt = (int(x) for x in size[level - 1])
+        scale, magnitude = tables.quad_scale[level, 2], tables.quad_scale[level, 3]
+        margin = 1e-6 + kernels.ROUNDING * magnitude * total
+        sums, turns = np.empty(6), np.empty(3 * bt)
+        out = np.empty((bt // lt) * (bv // lv) * (bu // lu), np.int64)
+        nu, nv, nt = (int(x) for x in lattice.nodes[level])
+        some = np.random.default_rng(seed_).permutation(nt * nv * nu)[:30]
+        for t, v, u in zip(*np.unravel_index(some, (nt, nv, nu)), strict=True):
+            first, middle = t * bt, t * bt + bt // 2
+            kernels.turn_classes(first, middle, bt, n, cu, cv, tables.class_of, level, at, 0, near)
+            kernels.quad_node(
+                n, first, middle, bt, u * bu + bu // 2, v * bv + bv // 2, cu, cv, 0, near, problem.heft,
+                tables.quad_place, tables.quad_scale, level, tables.quads, at, words, words.view(np.int32),
+                coef, sums, turns,
+            )  # fmt: skip
+            kernels.quad_children(size, level, sums, turns, scale, margin, -(1 << 60), out)
+            box = scores[first : first + bt, v * bv : (v + 1) * bv, u * bu : (u + 1) * bu]
+            most = box.reshape(bt // lt, lt, bv // lv, lv, bu // lu, lu).max(axis=(1, 3, 5))
+            assert np.all(out.reshape(most.shape) >= most)
+
+
+def unpacked(words):
+    """A, gu, gv, huu, huv, hvv of quadratics' words, as integers."""
+    field = lambda low, bits: ((words >> np.uint64(low)) & np.uint64((1 << bits) - 1)).astype(int)  # noqa: E731
+    slopes = field(32, 12) - 2048, field(44, 12) - 2048
+    return field(0, 16), *slopes, field(16, 8) - 128, field(56, 8) - 128, field(24, 8) - 128
 
 
 @seed(5)
 @QUICK
-@given(st.integers(0, 2**32 - 1), st.integers(0, 2), st.integers(0, 4), st.integers(0, 4), st.integers(0, 4))
-def test_a_majorant_lies_above_its_window(seed_, kind, ru, rv, shift):
+@given(
+    st.integers(0, 2**32 - 1), st.integers(0, 2), st.tuples(*[st.integers(0, 5)] * 2),
+    st.tuples(*[st.integers(0, 2)] * 2), st.integers(0, 7), st.booleans(),
+)  # fmt: skip
+def test_a_quadratic_lies_above_its_window(seed_, kind, radius, grain, steps, flat):
     rng = np.random.default_rng(seed_)
     leaf = random_leaf(rng, kind, int(rng.integers(1, 20)), int(rng.integers(1, 20)))
-    pad = max(ru, rv) + 1
-    out = np.empty((leaf.shape[0] + 2 * pad, leaf.shape[1] + 2 * pad), np.uint32)
-    kernels.affine_table(leaf, ru, rv, pad, shift, out)
-    a, gu, gv = (
-        (out & 65535).astype(int),
-        ((out >> 16) & 255).astype(int) - 128,
-        (out >> 24).astype(int) - 128,
-    )
-    wide = np.pad(leaf.astype(int), pad + max(ru, rv))
-    rows, columns = out.shape
-    edge = max(ru, rv)
-    for dv in range(-rv, rv + 1):
-        for du in range(-ru, ru + 1):
-            moved = wide[edge + dv : edge + dv + rows, edge + du : edge + du + columns]
-            assert np.all(moved << shift <= a + gu * du + gv * dv)
+    (ru, rv), (eu, ev), steps = radius, grain, 2.0**steps
+    unit_g, unit_h = 2.0 ** rng.integers(-4, 2), 2.0 ** rng.integers(-6, 2)
+    rim_u, rim_v = (ru + (1 << eu) >> eu) + 1, (rv + (1 << ev) >> ev) + 1
+    rows, columns = (leaf.shape[0] >> ev) + 2 * rim_v + 2, (leaf.shape[1] >> eu) + 2 * rim_u + 2
+    out = np.empty((rows, columns), np.uint64)
+    most = 255.0 * steps
+    if flat:
+        table_kernels.flat_table(leaf, ru, rv, eu, ev, rim_u, rim_v, steps, out)
+    else:
+        most = table_kernels.quad_table(leaf, ru, rv, eu, ev, rim_u, rim_v, steps, unit_g, unit_h, out)
+    a, gu, gv, huu, huv, hvv = unpacked(out)
+    far = 40
+    wide = np.pad(leaf.astype(int), far)
+    # every cell that a record serves, and every displacement from it that the record provides for
+    for y in range(rows):
+        for x in range(columns):
+            middle_u, middle_v = (x - rim_u << eu) + (1 << eu >> 1), (y - rim_v << ev) + (1 << ev >> 1)
+            du = np.arange((x - rim_u << eu) - ru, (x - rim_u + 1 << eu) + ru) - middle_u
+            dv = np.arange((y - rim_v << ev) - rv, (y - rim_v + 1 << ev) + rv) - middle_v
+            held = wide[np.ix_(far + middle_v + dv, far + middle_u + du)]
+            u, v = du[None, :], dv[:, None]
+            terms = (
+                gu[y, x] * unit_g * u, gv[y, x] * unit_g * v, huu[y, x] * unit_h * u * u,
+                huv[y, x] * unit_h * u * v, hvv[y, x] * unit_h * v * v,
+            )  # fmt: skip
+            assert np.all(held * steps <= a[y, x] + sum(terms))
+            assert a[y, x] + sum(np.abs(t).max() for t in terms) <= most
     rim = np.concatenate([out[0], out[-1], out[:, 0], out[:, -1]])
-    assert np.all(rim == (128 << 16) | (128 << 24))  # what lies outside counts nothing
+    assert all(np.all(part == 0) for part in unpacked(rim))  # what lies outside counts nothing
 
 
 @seed(6)
