@@ -2,7 +2,9 @@
 
 The kernels take arrays and plain numbers only; ``table.py`` and ``grcsm.py`` validate and allocate.
 Integers throughout: a bound is a bound of the very scores that it prunes, and sums do not depend on order.
-No ``fastmath``: it assumes that NaN does not exist.
+Sums of quadratic bounds are the exception: single precision in any order, with a margin for rounding.
+``fastmath``, which assumes that NaN does not exist, only there: cells and tables hold none.
+Constants of ``_kernels_table.py`` are compiled in: remove ``__pycache__`` after a change to them.
 """
 
 from __future__ import annotations
@@ -15,8 +17,11 @@ from bimfit.registration._kernels_table import FULL, LANE, RIM
 LANE_SUM = (1 << LANE) - 1
 NOTHING = -(1 << 40)  # score of no pose at all
 SHIFT_NODE = 20  # bits of one index in a node's code
+PAD = 32  # points are filled up to a multiple of this with points of no weight: whole vectors
 RUN = 512  # points whose sums are kept in single precision
-ROUNDING = 2.0**-14  # such a sum's greatest error, as a share of its terms' magnitudes: RUN 2^-24, and to spare
+ROUNDING = (
+    2.0**-14
+)  # such a sum's greatest error, as a share of its terms' magnitudes: RUN 2^-24, and to spare
 
 # slots of the state vector
 HEAP, BEST, BEST_CODE, EVALUATIONS, PHASE, FOUND, BOUND = 0, 1, 2, 3, 4, 5, 6
@@ -241,7 +246,8 @@ def quad_pass(
 
     Points ``k0`` and on, their cells at ``base`` and on, their slack classes at ``own`` and on.
 
-    ``heft``: the points' weights; ``halves``: the low and high halves of ``words``. Each point's quadratic is moved to the cell that the point lies in. Slopes (u, v) and curvatures (uu, uv,
+    ``heft``: the points' weights; ``halves``: the low and high halves of ``words``. Each point's quadratic
+    is moved to the cell that the point lies in. Slopes (u, v) and curvatures (uu, uv,
     vv) a point are kept, weighted, in five stretches of ``coef``; ``sums``: constant, slopes and curvatures
     are added to. Three loops, so that all but the look-ups becomes vector code.
     """
@@ -258,7 +264,10 @@ def quad_pass(
         x = min(max(np.int32(cu[np.uint64(base + k)] + shift_u), np.int32(0)), right)
         y = min(max(np.int32(cv[np.uint64(base + k)] + shift_v), np.int32(0)), low)
         line = np.int32(np.int32(np.float32(y) * less_v) * width)
-        at[k] = np.int32(np.int32(line + np.int32(np.float32(x) * less_u)) + np.int32(np.int32(classes[np.uint64(own + k)]) * stride))
+        at[k] = np.int32(
+            np.int32(line + np.int32(np.float32(x) * less_u))
+            + np.int32(np.int32(classes[np.uint64(own + k)]) * stride)
+        )
     for k in range(m):
         words[k] = quads[np.uint64(offset + at[k])]
     two, zero_g, zero_h = np.float32(2.0), np.float32(2048.0), np.float32(128.0)
@@ -301,7 +310,7 @@ def quad_pass(
 
 @jit_inner_fast
 def turn_gain(m, base, other, cu, cv, coef, out, i):
-    """What moving ``m`` points from their cells at ``base`` to those at ``other`` adds to constant and slopes."""
+    """What moving ``m`` points from cells at ``base`` to those at ``other`` adds to constant and slopes."""
     two = np.float32(2.0)
     t0, t1, t2 = np.float32(0.0), np.float32(0.0), np.float32(0.0)
     for k in range(m):
@@ -327,7 +336,8 @@ def arch(slope, bend, half):
 
 @jit_inner
 def quad_node(
-    n, first, middle, bt, du, dv, cu, cv, own, classes, heft, where, unit, level, quads, at, words, halves, coef,
+    n, first, middle, bt, du, dv, cu, cv, own, classes, heft, where, unit, level, quads, at, words, halves,
+    coef,
     sums, turns,
 ):  # fmt: skip
     """Quadratic of a node's bound: ``sums`` at its middle, ``turns`` (3 an angle) what each angle adds.
@@ -398,13 +408,14 @@ def block_bounds(
     level, t, v0, nv, u0, nu, n, pu, pv, weight, start, cosine, sine, size, blocks, place, classes, slots, cu,
     cv, have, lists, list_counts, at, tally,
 ):  # fmt: skip
-    """Block bounds of nv x nu nodes of one level and angle into rows of ``tally``; caches what it works out."""
+    """Block bounds of nv x nu nodes of one level and angle into rows of ``tally``; keeps what it finds."""
     middle = t * size[level, 2] + size[level, 2] // 2
     ensure_cells(middle, n, pu, pv, cosine, sine, start, cu, cv, have)
     slot = slots[level] + t
     if list_counts[slot] < 0:
         merge_blocks(
-            middle * n, n, cu, cv, weight, level * n, classes, size[level, 0], size[level, 1], at, lists, list_counts,
+            middle * n, n, cu, cv, weight, level * n, classes, size[level, 0], size[level, 1], at, lists,
+            list_counts,
             slot,
         )  # fmt: skip
     bound_box(slot, n, lists, list_counts, blocks, place, level, v0, nv, u0, nu, tally)
@@ -442,7 +453,8 @@ def search(
             else:
                 stride = nu + RIM
                 block_bounds(
-                    first, it, 0, nv, 0, nu, n, pu, pv, weight, start, cosine, sine, size, blocks, place, classes,
+                    first, it, 0, nv, 0, nu, n, pu, pv, weight, start, cosine, sine, size, blocks, place,
+                    classes,
                     slots, cu, cv, have, lists, list_counts, at, tally,
                 )  # fmt: skip
             for b in range(nv):
@@ -498,7 +510,9 @@ def search(
                         if value < cut:
                             continue
                         code = pack(
-                            i // (nv * nu) * size[first, 2], (i // nu) % nv * size[first, 1], i % nu * size[first, 0]
+                            i // (nv * nu) * size[first, 2],
+                            (i // nu) % nv * size[first, 1],
+                            i % nu * size[first, 0],
                         )
                         if keeps(value, code, cut, cut_code):
                             heap_push(keys, codes, n_heap, (value << 6) | (63 - first), code)
@@ -566,7 +580,8 @@ def search(
             ct = t0 // lt + a
             if level > 1 and not majorant:
                 block_bounds(
-                    level - 1, ct, v0 // lv, fv, u0 // lu, fu, n, pu, pv, weight, start, cosine, sine, size, blocks,
+                    level - 1, ct, v0 // lv, fv, u0 // lu, fu, n, pu, pv, weight, start, cosine, sine, size,
+                    blocks,
                     place, classes, slots, cu, cv, have, lists, list_counts, at, tally,
                 )  # fmt: skip
                 evaluations += fv * fu
@@ -630,6 +645,138 @@ def search(
     if not collect:
         state[BEST], state[BEST_CODE] = cut, cut_code
     return stop
+
+
+# ---------------------------------------------------------------- whole slices
+
+# columns of a slice's whole numbers and of its real ones
+HOW, SCORE, OPEN, LEAF, WORK, KEPT = 0, 1, 2, 3, 4, 5
+PIVOT_U, PIVOT_V, REACH, SHARE, RMSE = 0, 1, 2, 3, 4
+FEW, FAR = 10, 11  # besides what ``search`` ends with: too few points left; farther out than the tables reach
+
+
+@jit
+def leaf_score(
+    code, n, pu, pv, weight, chunk, start, cosine, sine, lanes, prior, prior_at, has_prior, at, cu, cv
+):
+    """Score of one leaf, its log-prior added."""
+    mask = (1 << SHIFT_NODE) - 1
+    t, v, u = code >> (2 * SHIFT_NODE), (code >> SHIFT_NODE) & mask, code & mask
+    out = np.empty(1, np.int64)
+    fill_cells(0, n, cosine[t], sine[t], pu, pv, start, cu, cv)
+    score_box(0, n, cu, cv, weight, chunk, lanes, v, 1, u, 1, at, out, 0)
+    if has_prior:
+        out[0] += log_prior(prior, prior_at, 0, t, v, u)
+    return out[0]
+
+
+@jit
+def match_run(
+    begin, points, ends, motions, given, hints, frame, edges, options, step, cosine, sine, size, count,
+    half_angle,
+    lanes, blocks, place, quads, quad_place, quad_scale, class_of, slots, prior, prior_at, pu, pv, weight,
+    heft,
+    classes, cu, cv, have, lists, list_counts, near, near_have, at, words, halves, coef, tally, box, root,
+    keys,
+    codes, found_codes, found_scores, state, ints, reals,
+):  # fmt: skip
+    """Match slices one after the other from ``begin`` on; the first that was not done.
+
+    ``points`` (n, 2): all slices', slice i's ending at ``ends[i]``; ``motions`` (m, 4): what carries each
+    into the designed frame; ``given``: weights in steps, or empty; ``hints`` (m, 3): a leaf to begin with
+    (its motion u, v, theta), or NaN. ``frame``: see ``batch.py``. A slice is left undone where the queue is
+    full or the tables do not reach far enough: the caller makes room and comes again.
+    """
+    start = np.empty(5)
+    got = np.empty(4)
+    motion = np.empty(4)
+    nobody = given[:0]
+    for i in range(begin, ends.shape[0]):
+        first = ends[i - 1] if i > 0 else 0
+        own = points[first : ends[i]]
+        limit = own.shape[0] + PAD
+        prepare(
+            own, motions[i], frame[0:4], frame[4], frame[5], 1.0 / step[0], 1.0 / step[1],
+            given[first : ends[i]] if given.shape[0] > 0 else nobody, pu[:limit], pv[:limit], weight[:limit],
+            heft[:limit], got,
+        )  # fmt: skip
+        kept = int(got[3])
+        reals[i, PIVOT_U], reals[i, PIVOT_V], reals[i, REACH] = got[0], got[1], got[2]
+        ints[i, KEPT] = kept
+        if kept < frame[6]:
+            ints[i, HOW] = FEW
+            continue
+        if got[2] > frame[7]:
+            ints[i, HOW] = FAR
+            return i
+        n = (kept + PAD - 1) // PAD * PAD
+        start[0] = (got[0] + frame[8] - frame[10]) / step[0]
+        start[1] = (got[1] + frame[9] - frame[11]) / step[1]
+        start[2], start[3], start[4] = step[1] / step[0], step[0] / step[1], frame[12]
+        total, most = np.int64(0), np.uint64(1)
+        for k in range(kept):
+            total += np.int64(weight[k])
+            most = max(most, weight[k])
+        options[0], options[3], options[9] = n, max(1, LANE_SUM // (FULL * np.int64(most))), total
+        have[:] = 0
+        near_have[:] = 0
+        list_counts[:] = -1
+        point_classes(n, pu, pv, step[0], step[1], half_angle, class_of, classes)
+        state[:] = 0
+        state[BEST] = NOTHING
+        if not np.isnan(hints[i, 0]):
+            code = nearest_leaf(hints[i], motions[i], got, frame, step, count)
+            if code >= 0:
+                state[BEST_CODE] = code
+                state[BEST] = leaf_score(
+                    code, n, pu, pv, weight, options[3], start, cosine, sine, lanes, prior, prior_at,
+                    options[8],
+                    at, cu, cv,
+                )  # fmt: skip
+        ended = search(
+            options, pu[:n], pv[:n], weight[:n], heft[:n], start, cosine, sine, size, count, lanes, blocks,
+            place,
+            quads, quad_place, quad_scale, class_of, classes, slots, prior, prior_at, cu, cv, have, lists,
+            list_counts, near, near_have, at, words, halves, coef, tally, box, root, keys, codes, found_codes,
+            found_scores, state,
+        )  # fmt: skip
+        ints[i, HOW] = ended
+        if ended == HEAP_FULL:
+            return i
+        ints[i, SCORE], ints[i, OPEN], ints[i, LEAF] = state[BEST], state[BOUND], state[BEST_CODE]
+        ints[i, WORK] = state[EVALUATIONS]
+        # the leaf's motion of the data, after ``motions``: turn about the pivot, then shift
+        code, mask = state[BEST_CODE], (1 << SHIFT_NODE) - 1
+        c, s = cosine[code >> (2 * SHIFT_NODE)], sine[code >> (2 * SHIFT_NODE)]
+        du, dv = motions[i, 2] - got[0], motions[i, 3] - got[1]
+        motion[0] = c * motions[i, 0] - s * motions[i, 1]
+        motion[1] = s * motions[i, 0] + c * motions[i, 1]
+        motion[2] = c * du - s * dv + got[0] + frame[8] + step[0] * (code & mask)
+        motion[3] = s * du + c * dv + got[1] + frame[9] + step[1] * ((code >> SHIFT_NODE) & mask)
+        near_count, squares = fitness(own, motion, edges, frame[13])
+        reals[i, SHARE] = near_count / own.shape[0]
+        reals[i, RMSE] = np.sqrt(squares / near_count)
+    return ends.shape[0]
+
+
+@jit
+def nearest_leaf(pose, motion, pivot, frame, step, count):
+    """Code of the leaf nearest to a motion of the model, or -1 outside the window.
+
+    The data's motion after ``motion`` is (motion pose)^-1: ``pose`` (u, v, theta) in the same frame.
+    """
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    u = motion[0] * pose[0] - motion[1] * pose[1] + motion[2]
+    v = motion[1] * pose[0] + motion[0] * pose[1] + motion[3]
+    cosine, sine = motion[0] * c - motion[1] * s, motion[1] * c + motion[0] * s
+    # the inverse of (u, v, cosine, sine), taken at the pivot
+    du, dv = pivot[0] - u, pivot[1] - v
+    t = int(np.rint((np.arctan2(-sine, cosine) - frame[14]) / step[2]))
+    a = int(np.rint((cosine * du + sine * dv - pivot[0] - frame[8]) / step[0]))
+    b = int(np.rint((cosine * dv - sine * du - pivot[1] - frame[9]) / step[1]))
+    if 0 <= t < count[0, 2] and 0 <= b < count[0, 1] and 0 <= a < count[0, 0]:
+        return pack(t, b, a)
+    return np.int64(-1)
 
 
 # ---------------------------------------------------------------- other matchers

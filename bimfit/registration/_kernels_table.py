@@ -61,7 +61,10 @@ def lane_table(leaf):
 
 @jit
 def block_table(leaf, bu, bv, slack, low_u, low_v, out):
-    """Overlapped block maxima: out[b] = max of leaf over b B - slack .. (b + 2) B - 2 + slack an axis; RIM zeros end a row."""
+    """Overlapped block maxima: out[b] = max of leaf over b B - slack .. (b + 2) B - 2 + slack an axis.
+
+    RIM zeros end a row.
+    """
     height, width = leaf.shape
     rows, columns = out.shape[0], out.shape[1] - RIM
     part = np.zeros((height, columns), np.uint8)
@@ -87,7 +90,11 @@ def block_table(leaf, bu, bv, slack, low_u, low_v, out):
 def pack_quad(a, gu, gv, huu, huv, hvv):
     """One word of a quadratic: A, huu, hvv in the low half; gu, gv, huv in the high half; signs by offset."""
     low = np.uint64(a) | (np.uint64(huu + 128) << np.uint64(16)) | (np.uint64(hvv + 128) << np.uint64(24))
-    high = np.uint64(gu + 2048) | (np.uint64(gv + 2048) << np.uint64(12)) | (np.uint64(huv + 128) << np.uint64(24))
+    high = (
+        np.uint64(gu + 2048)
+        | (np.uint64(gv + 2048) << np.uint64(12))
+        | (np.uint64(huv + 128) << np.uint64(24))
+    )
     return low | (high << np.uint64(32))
 
 

@@ -13,16 +13,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from bimfit.config import Bound, SearchConfig
 from bimfit.errors import ConfigError
-from bimfit.geometry.pose import Array, Pose2D
+from bimfit.geometry.pose import Array, Pose2D, wrap_angle
 from bimfit.registration import _kernels as kernels
+from bimfit.registration import _kernels_table as table_kernels
 from bimfit.registration.lattice import Integers, Lattice
 from bimfit.registration.result import Stop
 from bimfit.registration.table import BLUR_REACH, Tables, Target
 
 MIN_POINTS = 3
-PAD = 32  # points are filled up to a multiple of this with points of no weight: whole vectors
+PAD = kernels.PAD
 WEIGHT_STEPS = 255  # unequal weights are rounded to this many steps of the greatest, or fewer
 MOST_WEIGHT = 300_000  # steps of all points together that the kernels' 32 bits hold
+NOMINAL = 160  # points that the first level is chosen for, so that it depends on the lattice alone
 ROOT_COST = 300_000.0  # look-ups that bounding the whole first level may cost
 TIME_SLICE = 2_000  # evaluations between two looks at the clock
 NOTHING = kernels.NOTHING
@@ -37,7 +39,7 @@ class Problem:
     Attributes
     ----------
     tables : Tables
-    pivot : ndarray, shape (2,)
+    pivot : tuple of 2 float
         The data turn about it, m.
     pu, pv : ndarray, shape (n,)
         Points about the pivot, in cells.
@@ -50,7 +52,7 @@ class Problem:
     """
 
     tables: Tables
-    pivot: Array
+    pivot: tuple[float, float]
     pu: Array
     pv: Array
     weight: NDArray[np.uint64]
@@ -67,7 +69,7 @@ class Problem:
     @property
     def chunk(self) -> int:
         """Points whose sum fits a lane of a word."""
-        return max(1, kernels.LANE_SUM // (kernels.FULL * int(self.weight.max(initial=1))))
+        return max(1, kernels.LANE_SUM // (table_kernels.FULL * int(self.weight.max(initial=1))))
 
 
 def pose_problem(
@@ -90,7 +92,7 @@ def pose_problem(
     """
     lattice = lattice_of(config)
     n = len(points)
-    given, unit, rounding = _weights(weights, n)
+    given, unit, rounding = weight_steps(weights, n)
     margin = BLUR_REACH * target.blur + lattice.step[0] + lattice.step[1]
     low_u, low_v, high_u, high_v = target.box
     box = np.array([low_u - margin, low_v - margin, high_u + margin, high_v + margin])
@@ -119,14 +121,25 @@ def pose_problem(
         ]
     )
     kept = -(-kept // PAD) * PAD
-    return Problem(tables, out[:2], pu[:kept], pv[:kept], weight[:kept], heft[:kept], unit, start, rounding)
+    return Problem(
+        tables,
+        (float(out[0]), float(out[1])),
+        pu[:kept],
+        pv[:kept],
+        weight[:kept],
+        heft[:kept],
+        unit,
+        start,
+        rounding,
+    )
 
 
-def _weights(weights: ArrayLike | None, n: int) -> tuple[NDArray[np.uint64], float, float]:
+def weight_steps(weights: ArrayLike | None, n: int) -> tuple[NDArray[np.uint64], float, float]:
+    """Weights as whole steps (empty: all 1), the score of one step, and what rounding can change."""
     if n > MOST_WEIGHT:
         raise ConfigError(f"{n} points in one slice are too many", remedy="thin the scan or the slices")
     if weights is None:
-        return _UNIT, 1.0 / kernels.FULL, 0.5 * n / kernels.FULL
+        return _UNIT, 1.0 / table_kernels.FULL, 0.5 * n / table_kernels.FULL
     values = np.asarray(weights, float)
     if values.shape != (n,) or not np.all(np.isfinite(values)) or np.any(values < 0.0):
         raise ConfigError(f"weights are {n} numbers of at least 0, one a point")
@@ -135,8 +148,8 @@ def _weights(weights: ArrayLike | None, n: int) -> tuple[NDArray[np.uint64], flo
         raise ConfigError("all weights are 0")
     steps = max(1, min(WEIGHT_STEPS, MOST_WEIGHT // max(n, 1)))
     whole = np.rint(values * (steps / top))
-    rounding = float(0.5 * values.sum() / kernels.FULL + 0.5 * n * top / steps)
-    return whole.astype(np.uint64), top / (steps * kernels.FULL), rounding
+    rounding = float(0.5 * values.sum() / table_kernels.FULL + 0.5 * n * top / steps)
+    return whole.astype(np.uint64), top / (steps * table_kernels.FULL), rounding
 
 
 def prior_table(config: SearchConfig, lattice: Lattice, unit: float) -> tuple[Integers, Integers, bool]:
@@ -178,12 +191,12 @@ class Plan:
         lattice = tables.lattice
         top, nodes, size = lattice.top, lattice.nodes, lattice.size
         quads = np.flatnonzero(tables.quad_place[:, 0] >= 0)
-        first = first_level(lattice, capacity, int(quads.max(initial=1)))
+        first = first_level(lattice, NOMINAL, int(quads.max(initial=1)))
         fan = max((int((size[h] // size[h - 1]).prod()) for h in range(1, top + 1)), default=1)
         ends = np.cumsum(nodes[:, 2])
-        rows, columns = int(nodes[first, 1]), int(nodes[first, 0]) + kernels.RIM
+        rows, columns = int(nodes[first, 1]), int(nodes[first, 0]) + table_kernels.RIM
         split = [(size[h] // size[h - 1])[:2] for h in range(1, top + 1)]
-        tally = max([rows * columns, *(int(v) * (int(u) + kernels.RIM) for u, v in split)])
+        tally = max([rows * columns, *(int(v) * (int(u) + table_kernels.RIM) for u, v in split)])
         slots = np.concatenate([[0], ends[:-1]]).astype(np.int64)
         return cls(
             first, int(nodes[first].prod()), fan, slots, lattice.half_angle, int(ends[-1]),
@@ -196,6 +209,8 @@ class Workspace:
 
     def __init__(self, plan: Plan, lattice: Lattice) -> None:
         n, angles, wide = plan.capacity, lattice.count[2], int(lattice.nodes[plan.first, :2].prod())
+        self.pu, self.pv = np.empty(n), np.empty(n)
+        self.weight, self.heft = np.empty(n, np.uint64), np.empty(n, np.float32)
         self.classes = np.empty((lattice.top + 1) * n, np.uint8)
         self.cu, self.cv = np.empty(angles * n, np.int32), np.empty(angles * n, np.int32)
         self.flags = np.zeros(angles + plan.slot_count, np.uint8)
@@ -233,7 +248,7 @@ _LOCAL = threading.local()
 KEPT_WORKSPACES = 4
 
 
-def _workspace(tables: Tables, n: int) -> tuple[Plan, Workspace]:
+def workspace(tables: Tables, n: int) -> tuple[Plan, Workspace]:
     """The calling thread's plan and scratch arrays for some tables, made anew only for more points."""
     kept: dict[int, tuple[Tables, Plan, Workspace]] = _LOCAL.__dict__.setdefault("kept", {})
     held = kept.get(id(tables))
@@ -276,7 +291,7 @@ def run(
 ) -> Outcome:  # fmt: skip
     """Search, resuming after every look at the clock or growth of the queue."""
     tables, lattice, n = problem.tables, problem.tables.lattice, problem.n
-    plan, work = _workspace(tables, n)
+    plan, work = workspace(tables, n)
     prior, prior_at, has_prior = prior_table(config, lattice, problem.unit)
     kernels.point_classes(
         n, problem.pu, problem.pv, lattice.step[0], lattice.step[1], plan.half_angle, tables.class_of,
@@ -295,11 +310,13 @@ def run(
     )  # fmt: skip
     while True:
         ended = kernels.search(
-            options, problem.pu, problem.pv, problem.weight, problem.heft, problem.start, tables.cosine, tables.sine,
+            options, problem.pu, problem.pv, problem.weight, problem.heft, problem.start, tables.cosine,
+            tables.sine,
             lattice.size, lattice.nodes, tables.lanes, tables.blocks, tables.block_place, tables.quads,
             tables.quad_place, tables.quad_scale, tables.class_of, work.classes, plan.slots, prior, prior_at,
             work.cu, work.cv, work.have, work.lists, work.list_counts, work.near, work.near_have, work.at,
-            work.words, work.halves, work.coef, work.tally, work.box, work.root, work.keys, work.codes, work.found, work.values, state,
+            work.words, work.halves, work.coef, work.tally, work.box, work.root, work.keys, work.codes,
+            work.found, work.values, state,
         )  # fmt: skip
         if ended == kernels.HEAP_FULL:
             work.grow("keys", "codes")
@@ -345,10 +362,19 @@ def _leaf_score(
     return value, (index[2] << (2 * kernels.SHIFT_NODE)) | (index[1] << kernels.SHIFT_NODE) | index[0]
 
 
-def pose_of(problem: Problem, index: tuple[int, int, int], prior: Pose2D) -> Pose2D:
-    """Motion of the model that a leaf stands for: the leaf moves the data, so it is inverted."""
-    u, v, theta = problem.tables.lattice.motion(index)
-    return prior @ Pose2D.about(problem.pivot, u, v, theta).inverse()
+def pose_of(
+    lattice: Lattice, pivot: tuple[float, float], index: tuple[int, int, int], prior: Pose2D
+) -> Pose2D:
+    """Motion of the model that a leaf stands for: the leaf moves the data, so it is inverted.
+
+    ``prior @ Pose2D.about(pivot, *motion).inverse()``, written out: it is worked out for every slice.
+    """
+    u, v, theta = lattice.motion(index)
+    c, s = math.cos(theta), math.sin(theta)
+    a, b = pivot[0] + u, pivot[1] + v
+    x, y = pivot[0] - c * a - s * b, pivot[1] + s * a - c * b
+    c, s = math.cos(prior.theta), math.sin(prior.theta)
+    return Pose2D(prior.u + c * x - s * y, prior.v + s * x + c * y, wrap_angle(prior.theta - theta))
 
 
 def leaf_of(problem: Problem, pose: Pose2D, prior: Pose2D) -> tuple[int, int, int] | None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from bimfit.config import SearchConfig
 from bimfit.geometry.pose import Pose2D
-from bimfit.registration.grcsm import Outcome, Problem, pose_of, run
+from bimfit.registration.grcsm import Problem, pose_of, run
 from bimfit.registration.lattice import Integers
 from bimfit.registration.result import Mode
 
@@ -17,14 +17,14 @@ MAX_MODES = 16
 APART = 3  # lattice steps without a near-optimal pose that part two clusters
 
 
-def near_optimal(problem: Problem, config: SearchConfig, best: Outcome, prior: Pose2D) -> tuple[Mode, ...]:
+def near_optimal(problem: Problem, config: SearchConfig, score: int, prior: Pose2D) -> tuple[Mode, ...]:
     """Rivals of the best pose: the best of every cluster but its own, best first.
 
     Poses whose score is at least (1 - delta) times the best are collected by the same bounds, and
     joined into clusters where they lie within three lattice steps on every axis. A ridge along a
     direction that the data leave free is thus one cluster, not many.
     """
-    floor = math.ceil(best.score * (1.0 - config.delta)) if best.score > 0 else best.score
+    floor = math.ceil(score * (1.0 - config.delta)) if score > 0 else score
     quiet = dataclasses.replace(config, eps=0.0, max_evaluations=None)
     codes, scores = run(problem, quiet, collect_from=floor).found
     order = np.lexsort((codes, -scores))
@@ -35,7 +35,12 @@ def near_optimal(problem: Problem, config: SearchConfig, best: Outcome, prior: P
     rivals = [int(i) for i in np.sort(first) if label[i] != own][:MAX_MODES]
     return tuple(
         Mode(
-            pose_of(problem, (int(index[i, 0]), int(index[i, 1]), int(index[i, 2])), prior).as_array(),
+            pose_of(
+                problem.tables.lattice,
+                problem.pivot,
+                (int(index[i, 0]), int(index[i, 1]), int(index[i, 2])),
+                prior,
+            ).as_array(),
             float(scores[order[i]]) * problem.unit,
         )
         for i in rivals

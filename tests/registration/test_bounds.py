@@ -47,8 +47,15 @@ def random_problem(seed_, tests, levels, kind, bound, weighted, sigma=(0.5, 12.0
     weight = (rng.integers(0, 256, n) if weighted else np.ones(n)).astype(np.uint64)
     start = np.array([*rng.uniform(-10, 60, 2), 1.0, 1.0, 0.0])
     return grcsm.Problem(
-        made, np.zeros(2), points[:, 0].copy(), points[:, 1].copy(), weight, weight.astype(np.float32),
-        1 / 255, start, 0.0,
+        made,
+        (0.0, 0.0),
+        points[:, 0].copy(),
+        points[:, 1].copy(),
+        weight,
+        weight.astype(np.float32),
+        1 / 255,
+        start,
+        0.0,
     )
 
 
@@ -131,11 +138,13 @@ def test_no_block_holds_a_leaf_above_its_bound(seed_, shape, kind, weighted):
 @given(st.integers(0, 2**32 - 1), SHAPES, st.integers(0, 2), st.booleans())
 def test_no_child_holds_a_leaf_above_its_quadratic_bound(seed_, shape, kind, weighted):
     """Quadratic bounds of every child of random nodes of every level that has them."""
-    problem = random_problem(seed_, *shape, kind, "majorant", weighted, sigma=(3.0, 40.0))
+    problem = random_problem(seed_, *shape, kind, "majorant", weighted, sigma=(2.0, 8.0))
     tables, lattice, n = problem.tables, problem.tables.lattice, problem.n
     scores = naive_scores(problem)
     size, total = lattice.size, float(problem.weight.sum())
-    cu, cv = (np.concatenate(c) for c in zip(*[cells_at(problem, t) for t in range(lattice.count[2])]))
+    cu, cv = (
+        np.concatenate(c) for c in zip(*[cells_at(problem, t) for t in range(lattice.count[2])], strict=True)
+    )
     at, words = np.empty(2 * max(n, kernels.RUN), np.int32), np.empty(kernels.RUN, np.uint64)
     coef, near = np.empty(5 * kernels.RUN, np.float32), np.empty(n, np.uint8)
     for level in np.flatnonzero(tables.quad_place[:, 0] >= 0):

@@ -15,7 +15,8 @@ from bimfit.config import SearchConfig
 from bimfit.errors import ConfigError
 from bimfit.geometry.pose import Pose2D
 from bimfit.geometry.slice import Slice
-from bimfit.registration.matchers import MATCHERS, match, matcher
+from bimfit.registration.fitness import fitness_of
+from bimfit.registration.matchers import MATCHERS, match, match_many, matcher
 from bimfit.registration.table import Target
 
 SMALL = SearchConfig(window=(0.02, 0.015, math.radians(6)), tolerance=(0.002, 0.002, math.radians(0.6)))
@@ -152,6 +153,56 @@ def test_budgets_and_eps_leave_a_true_gap(target, scenes):
     assert long.stop == "proven" and long.score == best
 
 
+@pytest.mark.parametrize("blur", [0.003, 0.006])
+def test_the_full_window_equals_brute_force(scenes, blur):
+    """All 14 million poses of the paper's window; the bench shows it over many slices."""
+    sharp = Target.of(scenes.boards_edges(), blur)
+    for slice_, *_ in scenes.make_slices(2, seed=13):
+        found = match(sharp, slice_, Pose2D(), SearchConfig())
+        best = MATCHERS["brute"](sharp, slice_, Pose2D(), SearchConfig())
+        assert found.score == best.score and np.array_equal(found.parameters, best.parameters)
+
+
+def test_many_slices_at_once_are_as_one_by_one(scenes):
+    """A target of its own: tables must grow when a later slice reaches farther than the first did."""
+    slices = [s for s, *_ in scenes.make_slices(6, seed=14)]
+    near = np.abs(slices[0].points[:, 0]) < 0.03
+    slices[0] = dataclasses.replace(slices[0], points=slices[0].points[near])
+    holes = slices[1].points.copy()
+    holes[::4] = np.nan
+    slices[1] = dataclasses.replace(slices[1], points=holes)
+    slices[2:2] = [Slice(0.0, np.zeros((0, 2))), Slice(0.0, np.full((30, 2), 50.0))]
+    priors = [Pose2D(0.001 * k, 0.0, 0.01 * k) for k in range(len(slices))]
+    fresh = Target.of(scenes.boards_edges(), 0.006)
+    alone = [match(fresh, s, p, SearchConfig()) for s, p in zip(slices, priors, strict=True)]
+    assert [r.status.name for r in alone] == ["ok", "ok", "no_data", "no_data", "ok", "ok", "ok", "ok"]
+    for threads in (1, 2, 3):
+        other = Target.of(scenes.boards_edges(), 0.006)
+        many = match_many(other, slices, priors, SearchConfig(), threads=threads)
+        for a, b in zip(alone, many, strict=True):
+            assert np.array_equal(a.parameters, b.parameters, equal_nan=True)
+            assert (a.score == b.score or not a.found) and a.status == b.status and a.stop == b.stop
+    weights = [1.0 + np.arange(len(s.points)) % 2 for s in slices]
+    heavy = match_many(fresh, slices, priors, SearchConfig(), weights=weights, threads=2)
+    for s, p, w, b in zip(slices, priors, weights, heavy, strict=True):
+        a = match(fresh, s, p, SearchConfig(), weights=w)
+        assert np.array_equal(a.parameters, b.parameters, equal_nan=True)
+
+
+def test_the_pose_is_the_leafs_motion_undone(target, scenes):
+    """The compiled pose against composed motions, with a prior that turns and shifts."""
+    from bimfit.registration import grcsm
+
+    lattice, prior, pivot = grcsm.lattice_of(SMALL), Pose2D(0.3, -0.2, 2.9), (0.05, -0.04)
+    for index in ((0, 0, 0), (20, 3, 26), (13, 13, 13)):
+        expected = prior @ Pose2D.about(pivot, *lattice.motion(index)).inverse()
+        found = grcsm.pose_of(lattice, pivot, index, prior)
+        assert np.allclose(found.as_array(), expected.as_array(), atol=1e-12)
+    ((slice_, *_),) = scenes.make_slices(1, seed=15)
+    found = match(target, slice_, Pose2D(), SMALL)
+    assert (found.fitness, found.inlier_rmse) == pytest.approx(fitness_of(target, slice_.points, found.pose))
+
+
 def test_rivals_are_reported_and_not_averaged():
     """Two equal faces 30 mm apart: the data fit either."""
     faces = np.array([[[-0.1, 0.0], [0.1, 0.0]], [[-0.1, 0.03], [0.1, 0.03]]])
@@ -215,6 +266,7 @@ import math, numpy as np
 from bimfit.config import SearchConfig
 from bimfit.geometry.pose import Pose2D
 from bimfit.geometry.slice import Slice
+from bimfit.registration.fitness import fitness_of
 from bimfit.registration.matchers import MATCHERS
 from bimfit.registration.table import Target
 edges = np.array([[[-0.02, 0.0], [0.0, 0.0]], [[0.0, 0.0], [0.0, -0.01]]])

@@ -1,0 +1,186 @@
+"""Many slices by one compiled call: what a slice costs besides its search is paid once."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bimfit.config import Bound, SearchConfig
+from bimfit.geometry.pose import Array, Pose2D
+from bimfit.registration import _kernels as kernels
+from bimfit.registration import grcsm
+from bimfit.registration.fitness import INLIER_SIGMAS
+from bimfit.registration.lattice import Integers, Lattice
+from bimfit.registration.result import Stop
+from bimfit.registration.table import BLUR_REACH, Tables, Target
+
+_STOPS: dict[int, Stop] = {kernels.DONE: "proven", kernels.TOLERANCE: "tolerance", kernels.BUDGET: "budget"}
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a slice's search found, in the terms of the lattice.
+
+    Attributes
+    ----------
+    kept : int
+        Points that some pose of the window brings near the model; under three, nothing was searched.
+    index : tuple of 3 int
+        The best leaf (u, v, theta).
+    pivot : tuple of 2 float
+        What the data turned about, m.
+    score, bound : int
+        In steps of weight times table value.
+    share, rmse : float
+        Of the points within three blurs of the model: their share, and root mean square distance (m).
+    """
+
+    kept: int
+    index: tuple[int, int, int]
+    pivot: tuple[float, float]
+    score: int
+    bound: int
+    evaluations: int
+    stop: Stop
+    share: float
+    rmse: float
+    lattice: Lattice
+
+
+def search_slices(
+    target: Target,
+    slices: Sequence[Array],
+    priors: Sequence[Pose2D],
+    config: SearchConfig,
+    bound: Bound,
+    weights: NDArray[np.uint64],
+    unit: float,
+    incumbents: Sequence[Pose2D | None] | None = None,
+    threads: int = 1,
+) -> list[Found]:
+    """Search every slice's window; the outcome does not depend on the number of threads.
+
+    Parameters
+    ----------
+    slices : sequence of ndarray, shape (n, 2)
+        Points, contiguous float64.
+    weights : ndarray of uint64
+        Steps a point, all slices' one after the other; empty for unit weights.
+    unit : float
+        Score of one step.
+    incumbents : sequence of Pose2D or None, optional
+        A pose to begin with, a slice.
+    """
+    count = len(slices)
+    share = max(1, -(-count // (2 * threads))) if threads > 1 else count
+    ends = [0, *itertools.accumulate(len(points) for points in slices)]
+    parts = [(k, min(k + share, count)) for k in range(0, count, share)]
+
+    def work(part: tuple[int, int]) -> list[Found]:
+        a, b = part
+        own = weights[ends[a] : ends[b]] if len(weights) else weights
+        hints = None if incumbents is None else incumbents[a:b]
+        return _search(target, slices[a:b], priors[a:b], config, bound, own, unit, hints)
+
+    if len(parts) <= 1 or threads == 1:
+        return [found for part in parts for found in work(part)]
+    with ThreadPoolExecutor(threads) as pool:
+        return [found for done in pool.map(work, parts) for found in done]
+
+
+def _search(
+    target: Target, slices: Sequence[Array], priors: Sequence[Pose2D], config: SearchConfig, bound: Bound,
+    weights: NDArray[np.uint64], unit: float, incumbents: Sequence[Pose2D | None] | None,
+) -> list[Found]:  # fmt: skip
+    count, lattice = len(slices), grcsm.lattice_of(config)
+    points = slices[0] if count == 1 else np.concatenate(slices)
+    ends = np.array(list(itertools.accumulate(len(own) for own in slices)), np.int64)
+    motions = np.array([_back(prior) for prior in priors])
+    hints = np.full((count, 3), np.nan)
+    for i, pose in enumerate(incumbents or ()):
+        if pose is not None:
+            hints[i] = pose.u, pose.v, pose.theta
+    ints, reals = np.zeros((count, 6), np.int64), np.zeros((count, 5))
+    longest = max(len(own) for own in slices)
+    begin, reach = 0, 0.0
+    prior, prior_at, has_prior = grcsm.prior_table(config, lattice, unit)
+    while begin < count:
+        tables = target.tables(lattice, bound, reach)
+        begin = _run(
+            target, tables, begin, longest, points, ends, motions, weights, hints, config, prior, prior_at,
+            has_prior, ints, reals,
+        )  # fmt: skip
+        if begin < count:
+            reach = float(reals[begin, kernels.REACH])
+    return [_found(a, b, lattice) for a, b in zip(ints.tolist(), reals.tolist(), strict=True)]
+
+
+def _run(
+    target: Target, tables: Tables, begin: int, longest: int, points: Array, ends: Integers, motions: Array,
+    weights: NDArray[np.uint64], hints: Array, config: SearchConfig, prior: Integers, prior_at: Integers,
+    has_prior: bool, ints: Integers, reals: Array,
+) -> int:  # fmt: skip
+    """One compiled call: the first slice that was left undone, the queue already made longer for it."""
+    lattice = tables.lattice
+    plan, work = grcsm.workspace(tables, longest + kernels.PAD)
+    frame = np.array([*_frame(target, lattice), *_place(target, tables, config)])
+    limit = config.max_evaluations if config.max_evaluations is not None else 1 << 60
+    options = np.array([0, plan.first, lattice.top, 0, limit, 1 << 60, 0, 0, has_prior, 0], np.int64)
+    state = np.empty(kernels.STATE_SIZE, np.int64)
+    reached: int = kernels.match_run(
+        begin, points, ends, motions, weights, hints, frame, target.edges, options, _step(lattice),
+        tables.cosine, tables.sine, lattice.size, lattice.nodes, plan.half_angle, tables.lanes, tables.blocks,
+        tables.block_place, tables.quads, tables.quad_place, tables.quad_scale, tables.class_of, plan.slots,
+        prior, prior_at, work.pu, work.pv, work.weight, work.heft, work.classes, work.cu, work.cv, work.have,
+        work.lists, work.list_counts, work.near, work.near_have, work.at, work.words, work.halves, work.coef,
+        work.tally, work.box, work.root, work.keys, work.codes, work.found, work.values, state, ints, reals,
+    )  # fmt: skip
+    if reached < len(ends) and ints[reached, kernels.HOW] == kernels.HEAP_FULL:
+        work.grow("keys", "codes")
+    return reached
+
+
+@functools.lru_cache(maxsize=64)
+def _step(lattice: Lattice) -> Array:
+    return np.array(lattice.step)
+
+
+def _frame(target: Target, lattice: Lattice) -> tuple[float, ...]:
+    """Box of what can be met, how far a window shifts a point and swings a unit of radius, least points."""
+    margin = BLUR_REACH * target.blur + lattice.step[0] + lattice.step[1]
+    low_u, low_v, high_u, high_v = target.box
+    shift = math.hypot(lattice.half[0], lattice.half[1])
+    swing = 2.0 * math.sin(0.5 * min(lattice.half[2], math.pi))
+    return (
+        low_u - margin, low_v - margin, high_u + margin, high_v + margin, shift, swing,
+        float(grcsm.MIN_POINTS),
+    )  # fmt: skip
+
+
+def _place(target: Target, tables: Tables, config: SearchConfig) -> tuple[float, ...]:
+    """Reach of the tables, first motions u and v, the tables' corner, eps, inliers' gate, first angle."""
+    first, origin = tables.lattice.first, tables.origin
+    return (
+        tables.reach, first[0], first[1], float(origin[0]), float(origin[1]), config.eps,
+        INLIER_SIGMAS * target.blur, first[2],
+    )  # fmt: skip
+
+
+def _back(prior: Pose2D) -> tuple[float, float, float, float]:
+    """The prior's inverse: cosine, sine and shift."""
+    c, s = math.cos(prior.theta), math.sin(prior.theta)
+    return c, -s, -c * prior.u - s * prior.v, s * prior.u - c * prior.v
+
+
+def _found(ints: list[int], reals: list[float], lattice: Lattice) -> Found:
+    how, score, bound, leaf, work, kept = ints
+    pivot_u, pivot_v, _, share, rmse = reals
+    stop = _STOPS.get(how, "proven")
+    return Found(kept, grcsm.unpack(leaf), (pivot_u, pivot_v), score, bound, work, stop, share, rmse, lattice)
