@@ -109,7 +109,8 @@ def _search(
             hints[i] = pose.u, pose.v, pose.theta
     ints, reals = np.zeros((count, 6), np.int64), np.zeros((count, 5))
     longest = max(len(own) for own in slices)
-    begin, reach = 0, 0.0
+    begin = 0
+    reach = 0.0 if target.has_tables(lattice, bound) else _reach(target, slices, motions, lattice)
     prior, prior_at, has_prior = grcsm.prior_table(config, lattice, unit)
     while begin < count:
         tables = target.tables(lattice, bound, reach)
@@ -145,6 +146,22 @@ def _run(
     if reached < len(ends) and ints[reached, kernels.HOW] == kernels.HEAP_FULL:
         work.grow("keys", "codes")
     return reached
+
+
+def _reach(target: Target, slices: Sequence[Array], motions: Array, lattice: Lattice) -> float:
+    """Largest distance from its pivot of any slice's point, m: what the first tables must provide for."""
+    frame, step, none = np.array(_frame(target, lattice)), _step(lattice), np.zeros(0, np.uint64)
+    most = 0.0
+    for points, motion in zip(slices, motions, strict=True):
+        n = len(points)
+        scratch = np.empty(n), np.empty(n), np.empty(n, np.uint64), np.empty(n, np.float32)
+        out = np.empty(4)
+        kernels.prepare(
+            points, motion, frame[:4], frame[4], frame[5], 1.0 / step[0], 1.0 / step[1], none, *scratch, out
+        )
+        if out[3] >= grcsm.MIN_POINTS:
+            most = max(most, float(out[2]))
+    return most
 
 
 @functools.lru_cache(maxsize=64)

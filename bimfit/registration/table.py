@@ -348,6 +348,10 @@ class Target:
                 lattice, bound = key
                 self.tables(lattice, bound, reach)
 
+    def has_tables(self, lattice: Lattice, bound: Bound) -> bool:
+        """Whether some tables for a lattice are there already."""
+        return (lattice, bound) in self.kept
+
     def tables(self, lattice: Lattice, bound: Bound, reach: float) -> Tables:
         """Tables for a lattice and for points up to ``reach`` (m) from the pivot; built once and kept."""
         key = (lattice, bound)
