@@ -8,6 +8,7 @@ from bimfit._kernels import jit, jit_fast
 
 FULL = 255  # leaf value on the model itself
 LANE = 21  # bits of one of three sums that share a machine word
+MANY_TRIES = 12  # half a window up to which flatter quadratics are tried, too
 RIM = 16  # columns of zeros that end every row of a block table, so that rows are read in whole vectors
 # bits of a quadratic's word: constant, two slopes, three curvatures
 BITS_A, BITS_G, BITS_H = 16, 12, 8
@@ -162,6 +163,7 @@ def quad_table(leaf, ru, rv, eu, ev, rim_u, rim_v, scale, unit_g, unit_h, out):
     mu, mv = wu * (wu + 1) / 3.0, wv * (wv + 1) / 3.0  # mean of du^2, dv^2
     ku, kv = nu * (nu * nu - 1.0) * (nu * nu - 4.0) / 180.0, nv * (nv * nv - 1.0) * (nv * nv - 4.0) / 180.0
     flat = pack_quad(0, 0, 0, 0, 0, 0)
+    tries = 4 if max(wu, wv) <= MANY_TRIES else 1
     sums = np.empty(6)
     most = 0.0
     for y in range(rows):
@@ -185,7 +187,7 @@ def quad_table(leaf, ru, rv, eu, ev, rim_u, rim_v, scale, unit_g, unit_h, out):
                 bend_v = (sums[5] - mv * sums[0]) / (nu * kv)
             if wu > 0 and wv > 0:
                 twist = sums[4] / (nu * mu * nv * mv)
-            for f in range(4):
+            for f in range(tries):
                 bend = 1.0 - f / 3.0
                 gu, gv = whole(slope_u / unit_g, MOST_G), whole(slope_v / unit_g, MOST_G)
                 huu, hvv = whole(bend * bend_u / unit_h, MOST_H), whole(bend * bend_v / unit_h, MOST_H)

@@ -99,7 +99,7 @@ def _search(
     target: Target, slices: Sequence[Array], priors: Sequence[Pose2D], config: SearchConfig, bound: Bound,
     weights: NDArray[np.uint64], unit: float, incumbents: Sequence[Pose2D | None] | None,
 ) -> list[Found]:  # fmt: skip
-    count, lattice = len(slices), grcsm.lattice_of(config)
+    count, lattice = len(slices), grcsm.lattice_of(target, config, bound)
     points = slices[0] if count == 1 else np.concatenate(slices)
     ends = np.array(list(itertools.accumulate(len(own) for own in slices)), np.int64)
     motions = np.array([_back(prior) for prior in priors])

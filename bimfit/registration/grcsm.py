@@ -29,7 +29,20 @@ ROOT_COST = 300_000.0  # look-ups that bounding the whole first level may cost
 TIME_SLICE = 2_000  # evaluations between two looks at the clock
 NOTHING = kernels.NOTHING
 _UNIT: NDArray[np.uint64] = np.zeros(0, np.uint64)  # stands for unit weights
-lattice_of = functools.lru_cache(maxsize=64)(Lattice.of)
+ARM = 0.25  # a model's typical radius, as a share of its box's diagonal
+
+
+def lattice_of(target: Target, config: SearchConfig, bound: Bound) -> Lattice:
+    """The poses of a window; nodes are split by the model's size, unless the levels are asked for."""
+    low_u, low_v, high_u, high_v = target.box
+    derived = config.levels is None and config.axis_levels is None and bound != "block"
+    return _lattice(config, ARM * math.hypot(high_u - low_u, high_v - low_v) if derived else 0.0)
+
+
+@functools.lru_cache(maxsize=64)
+def _lattice(config: SearchConfig, arm: float) -> Lattice:
+    lattice = Lattice.of(config)
+    return lattice.balanced(arm) if arm > 0.0 else lattice
 
 
 @dataclass(frozen=True)
@@ -90,7 +103,7 @@ def pose_problem(
     ConfigError
         When the weights do not suit the points.
     """
-    lattice = lattice_of(config)
+    lattice = lattice_of(target, config, bound)
     n = len(points)
     given, unit, rounding = weight_steps(weights, n)
     margin = BLUR_REACH * target.blur + lattice.step[0] + lattice.step[1]

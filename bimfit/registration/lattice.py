@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeVar
 
@@ -35,12 +35,16 @@ class Lattice:
         sets the table's cell.
     tests, levels : tuple of 3 int
         s and L (Eq. 2).
+    wait : tuple of 3 int
+        Levels, counted from the leaves, at which an axis is not split yet. Where one step turns the data
+        by more cells than one step shifts it, theta waits: a node is then about as wide in every direction.
     """
 
     half: tuple[float, float, float]
     step: tuple[float, float, float]
     tests: tuple[int, int, int]
     levels: tuple[int, int, int]
+    wait: tuple[int, int, int] = (0, 0, 0)
 
     @classmethod
     def of(cls, config: SearchConfig) -> Lattice:
@@ -88,14 +92,17 @@ class Lattice:
     @cached_property
     def top(self) -> int:
         """Levels above the leaves."""
-        return max(self.levels)
+        return max(n + o for n, o in zip(self.levels, self.wait, strict=True))
 
     @cached_property
     def size(self) -> Integers:
         """Leaves an axis in a node of each level, shape (top + 1, 3)."""
         return np.array(
             [
-                [s ** min(h, n) for s, n in zip(self.tests, self.levels, strict=True)]
+                [
+                    s ** min(max(h - o, 0), n)
+                    for s, n, o in zip(self.tests, self.levels, self.wait, strict=True)
+                ]
                 for h in range(self.top + 1)
             ],
             np.int64,
@@ -116,6 +123,14 @@ class Lattice:
         """Half a node's angle on each level, seen from its middle leaf, rad; shape (top + 1,)."""
         half: Array = np.multiply(self.size[:, 2] // 2, self.step[2], dtype=np.float64)
         return half
+
+    def balanced(self, arm: float) -> Lattice:
+        """The same poses, theta waiting until a node turns points at ``arm`` (m) as far as it shifts them."""
+        if min(self.levels) == 0:
+            return self
+        ratio = arm * self.step[2] / min(self.step[:2])
+        wait = max(0, round(math.log(max(ratio, 1e-9)) / math.log(self.tests[2])))
+        return replace(self, wait=(0, 0, min(wait, max(self.levels[:2]))))
 
     def motion(self, index: tuple[int, int, int]) -> tuple[float, float, float]:
         """The motion (u, v, theta) of a leaf."""

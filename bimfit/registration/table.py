@@ -23,6 +23,7 @@ MAX_CLASSES = 6  # slack classes (rings) a level
 QUAD_REACH = 3.2  # widest block that a quadratic serves, in sigma; measured
 QUAD_SLACK = 6.0  # most slack by rotation in a level that has quadratics, in sigma
 QUAD_WINDOW = 3.0  # half a window beyond which a quadratic gains nothing over a plain maximum, in sigma
+QUAD_EXACT = 0.35  # half a window within which a quadratic is all but exact, in sigma
 GRAIN = 4.0  # half a block, in a record's cells; measured
 BLUR_REACH = math.sqrt(2.0 * math.log(2.0 * _kernels.FULL)) * 1.0001  # in sigma: farther, a cell holds 0
 
@@ -119,13 +120,15 @@ def tables_of_leaf(
 ) -> Tables:
     """Bounds of every level over any leaf table; ``sigma``: blur in cells of the finer and coarser axis."""
     slacks = _slacks(lattice, min(lattice.step[:2]), reach)
+    majorant = _majorant_levels(lattice, slacks, sigma[1]) if bound == "majorant" else ()
+    shared = _shared_level(lattice, slacks, majorant, sigma[0])
+    slacks = [slacks[max(h, shared)] if h in majorant else own for h, own in enumerate(slacks)]
     class_of = _classes(slacks)
     if bound == "block":
         blocks, block_place = _printed_blocks(leaf, origin, lattice)
     else:
-        blocks, block_place = _overlapped_blocks(leaf, lattice, slacks)
-    majorant = _majorant_levels(lattice, slacks, sigma[1]) if bound == "majorant" else ()
-    quads, quad_place, quad_scale = _quads(leaf, lattice, slacks, majorant, sigma[0])
+        blocks, block_place = _overlapped_blocks(leaf, lattice, slacks, max(majorant, default=1))
+    quads, quad_place, quad_scale = _quads(leaf, lattice, slacks, majorant, shared, sigma[0])
     angles = lattice.angles
     return Tables(
         lattice, bound, origin, leaf, _kernels.lane_table(leaf), blocks, block_place, quads, quad_place,
@@ -186,14 +189,20 @@ def _majorant_levels(lattice: Lattice, slacks: list[Integers], sigma: float) -> 
     )
 
 
+def _shared_level(lattice: Lattice, slacks: list[Integers], levels: tuple[int, ...], sigma: float) -> int:
+    """The coarsest level whose quadratics are all but exact: finer ones look their nodes up in its tables."""
+    fine = [h for h in levels if float(lattice.size[h, :2].max() // 2 + slacks[h][-1]) <= QUAD_EXACT * sigma]
+    return max(fine, default=0)
+
+
 def _overlapped_blocks(
-    leaf: NDArray[np.uint8], lattice: Lattice, slacks: list[Integers]
+    leaf: NDArray[np.uint8], lattice: Lattice, slacks: list[Integers], lowest: int
 ) -> tuple[NDArray[np.uint8], Integers]:
     height, width = leaf.shape
     place = np.zeros((lattice.top + 1, MAX_CLASSES, 5), np.int64)
     parts: list[NDArray[np.uint8]] = []
     offset = 0
-    for level in range(1, lattice.top + 1):
+    for level in range(lowest, lattice.top + 1):
         bu, bv = int(lattice.size[level, 0]), int(lattice.size[level, 1])
         for c, slack in enumerate(slacks[level].tolist()):
             low_u, low_v = -((2 * bu - 2 + slack) // bu), -((2 * bv - 2 + slack) // bv)
@@ -242,6 +251,7 @@ def _quads(
     lattice: Lattice,
     slacks: list[Integers],
     levels: tuple[int, ...],
+    shared: int,
     sigma: float,
 ) -> tuple[NDArray[np.uint64], Integers, Array]:
     height, width = leaf.shape
@@ -250,10 +260,15 @@ def _quads(
     parts: list[NDArray[np.uint64]] = []
     offset, angles = 0, 0
     steps, unit_g, unit_h = _units(sigma)
-    for level in levels:
+    for level in levels[::-1]:
+        if level < shared:
+            place[level], scales[level] = place[shared], scales[shared]
+            place[level, 7] = angles
+            angles += int(lattice.nodes[level, 2])
+            continue
         own = slacks[level].tolist()
         ru, rv = int(lattice.size[level, 0]) // 2, int(lattice.size[level, 1]) // 2
-        eu, ev = _grain(ru), _grain(rv)
+        eu, ev = (_grain(r + own[-1] // 2) for r in (ru, rv))
         most_u, most_v = ru + own[-1] + (1 << eu), rv + own[-1] + (1 << ev)
         rim_u, rim_v = (most_u >> eu) + 1, (most_v >> ev) + 1
         columns, rows = rim_u + 1 - (-(width + most_u) >> eu), rim_v + 1 - (-(height + most_v) >> ev)

@@ -16,6 +16,7 @@ from bimfit.errors import ConfigError
 from bimfit.geometry.pose import Pose2D
 from bimfit.geometry.slice import Slice
 from bimfit.registration.fitness import fitness_of
+from bimfit.registration.lattice import Lattice
 from bimfit.registration.matchers import MATCHERS, match, match_many, matcher
 from bimfit.registration.table import Target
 
@@ -193,7 +194,7 @@ def test_the_pose_is_the_leafs_motion_undone(target, scenes):
     """The compiled pose against composed motions, with a prior that turns and shifts."""
     from bimfit.registration import grcsm
 
-    lattice, prior, pivot = grcsm.lattice_of(SMALL), Pose2D(0.3, -0.2, 2.9), (0.05, -0.04)
+    lattice, prior, pivot = Lattice.of(SMALL), Pose2D(0.3, -0.2, 2.9), (0.05, -0.04)
     for index in ((0, 0, 0), (20, 3, 26), (13, 13, 13)):
         expected = prior @ Pose2D.about(pivot, *lattice.motion(index)).inverse()
         found = grcsm.pose_of(lattice, pivot, index, prior)
@@ -267,6 +268,7 @@ from bimfit.config import SearchConfig
 from bimfit.geometry.pose import Pose2D
 from bimfit.geometry.slice import Slice
 from bimfit.registration.fitness import fitness_of
+from bimfit.registration.lattice import Lattice
 from bimfit.registration.matchers import MATCHERS
 from bimfit.registration.table import Target
 edges = np.array([[[-0.02, 0.0], [0.0, 0.0]], [[0.0, 0.0], [0.0, -0.01]]])
