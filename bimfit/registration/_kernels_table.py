@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bimfit._kernels import jit, jit_fast
+from bimfit._kernels import jit, jit_fast, jit_inner_fast
 
 FULL = 255  # leaf value on the model itself
 LANE = 21  # bits of one of three sums that share a machine word
@@ -99,40 +99,58 @@ def pack_quad(a, gu, gv, huu, huv, hvv):
     return low | (high << np.uint64(32))
 
 
-@jit_fast
+@jit_inner_fast
 def residual(wide, y, x, ru, rv, gu, gv, huu, huv, hvv):
     """Greatest value over a window less gu du + gv dv + huu du^2 + huv du dv + hvv dv^2."""
     least = np.float32(-1e30)
     for a in range(2 * rv + 1):
         dv = np.float32(a - rv)
-        row = wide[y + a, x : x + 2 * ru + 1]
+        line = np.uint64(y + a)
         steady = dv * (gv + hvv * dv)
         slope = gu + huv * dv
-        for b in range(row.shape[0]):
+        for b in range(2 * ru + 1):
             du = np.float32(np.int32(b) - np.int32(ru))
-            least = max(least, row[b] - du * (slope + huu * du) - steady)
+            least = max(least, wide[line, np.uint64(x + b)] - du * (slope + huu * du) - steady)
     return least
 
 
 @jit_fast
-def moments(wide, y, x, ru, rv, out):
-    """Sums over a window of value, and of value times du, dv, du^2, du dv, dv^2."""
-    out[:] = 0.0
+def row_sums(wide, ru, eu, columns, sums, tops):
+    """Sums of value, value du and value du^2 (3, rows, columns), and tops, over each record's row windows."""
+    for y in range(wide.shape[0]):
+        line = np.uint64(y)
+        for x in range(columns):
+            s0, s1, s2, top = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
+            for b in range(2 * ru + 1):
+                du = np.float32(np.int32(b) - np.int32(ru))
+                value = wide[line, np.uint64((x << eu) + b)]
+                s0 += value
+                s1 += value * du
+                s2 += value * du * du
+                top = max(top, value)
+            sums[0, y, x], sums[1, y, x], sums[2, y, x] = s0, s1, s2
+            tops[y, x] = top
+
+
+@jit_fast
+def window_sums(sums, tops, y, rv, out):
+    """Sums over the windows of one row of records, in ``out`` (7, columns): value times 1, du, dv, du^2, du dv,
+    dv^2; and the greatest value.
+    """  # fmt: skip
+    for k in range(7):
+        for x in range(out.shape[1]):
+            out[k, x] = np.float32(0.0)
     for a in range(2 * rv + 1):
-        dv = float(a - rv)
-        row = wide[y + a, x : x + 2 * ru + 1]
-        s0, s1, s2 = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        for b in range(row.shape[0]):
-            du = np.float32(np.int32(b) - np.int32(ru))
-            s0 += row[b]
-            s1 += row[b] * du
-            s2 += row[b] * du * du
-        out[0] += s0
-        out[1] += s1
-        out[2] += s0 * dv
-        out[3] += s2
-        out[4] += s1 * dv
-        out[5] += s0 * dv * dv
+        dv = np.float32(a - rv)
+        for x in range(out.shape[1]):
+            s0, s1 = sums[0, y + a, x], sums[1, y + a, x]
+            out[0, x] += s0
+            out[1, x] += s1
+            out[2, x] += s0 * dv
+            out[3, x] += sums[2, y + a, x]
+            out[4, x] += s1 * dv
+            out[5, x] += s0 * dv * dv
+            out[6, x] = max(out[6, x], tops[y + a, x])
 
 
 @jit
@@ -164,36 +182,40 @@ def quad_table(leaf, ru, rv, eu, ev, rim_u, rim_v, scale, unit_g, unit_h, out):
     ku, kv = nu * (nu * nu - 1.0) * (nu * nu - 4.0) / 180.0, nv * (nv * nv - 1.0) * (nv * nv - 4.0) / 180.0
     flat = pack_quad(0, 0, 0, 0, 0, 0)
     tries = 4 if max(wu, wv) <= MANY_TRIES else 1
-    sums = np.empty(6)
+    parts = np.empty((3, wide.shape[0], columns), np.float32)
+    tops = np.empty((wide.shape[0], columns), np.float32)
+    row_sums(wide, wu, eu, columns, parts, tops)
+    sums = np.empty((7, columns), np.float32)
     most = 0.0
     for y in range(rows):
+        window_sums(parts, tops, y << ev, wv, sums)
         for x in range(columns):
-            moments(wide, y << ev, x << eu, wu, wv, sums)
-            if sums[0] == 0.0:
+            top = float(sums[6, x])
+            if top == 0.0:
                 out[y, x] = flat
                 continue
-            top = residual(
-                wide, y << ev, x << eu, wu, wv, np.float32(0.0), np.float32(0.0), np.float32(0.0),
-                np.float32(0.0), np.float32(0.0),
-            )  # fmt: skip
             best, word = top, pack_quad(min(MOST_A, int(np.ceil(top))), 0, 0, 0, 0, 0)
             peak = top
             slope_u, slope_v, bend_u, bend_v, twist = 0.0, 0.0, 0.0, 0.0, 0.0
             if wu > 0:
-                slope_u = sums[1] / (nv * nu * mu)
-                bend_u = (sums[3] - mu * sums[0]) / (nv * ku)
+                slope_u = sums[1, x] / (nv * nu * mu)
+                bend_u = (sums[3, x] - mu * sums[0, x]) / (nv * ku)
             if wv > 0:
-                slope_v = sums[2] / (nu * nv * mv)
-                bend_v = (sums[5] - mv * sums[0]) / (nu * kv)
+                slope_v = sums[2, x] / (nu * nv * mv)
+                bend_v = (sums[5, x] - mv * sums[0, x]) / (nu * kv)
             if wu > 0 and wv > 0:
-                twist = sums[4] / (nu * mu * nv * mv)
+                twist = sums[4, x] / (nu * mu * nv * mv)
             for f in range(tries):
                 bend = 1.0 - f / 3.0
                 gu, gv = whole(slope_u / unit_g, MOST_G), whole(slope_v / unit_g, MOST_G)
                 huu, hvv = whole(bend * bend_u / unit_h, MOST_H), whole(bend * bend_v / unit_h, MOST_H)
                 huv = whole(bend * twist / unit_h, MOST_H)
+                slopes = unit_g * (abs(gu) * wu + abs(gv) * wv)
+                bends = unit_h * (abs(huu) * wu * wu + abs(huv) * wu * wv + abs(hvv) * wv * wv)
+                # single precision: terms of the sum's magnitude lose a few parts in ten million
                 a = np.ceil(
                     0.05
+                    + 1e-6 * (top + slopes + bends)
                     + residual(
                         wide, y << ev, x << eu, wu, wv, np.float32(gu * unit_g), np.float32(gv * unit_g),
                         np.float32(huu * unit_h), np.float32(huv * unit_h), np.float32(hvv * unit_h),
@@ -202,8 +224,7 @@ def quad_table(leaf, ru, rv, eu, ev, rim_u, rim_v, scale, unit_g, unit_h, out):
                 mean = a + unit_h * (huu * mu + hvv * mv)
                 if 0.0 <= a <= MOST_A and mean < best:
                     best, word = mean, pack_quad(int(a), gu, gv, huu, huv, hvv)
-                    peak = a + unit_g * (abs(gu) * wu + abs(gv) * wv)
-                    peak += unit_h * (abs(huu) * wu * wu + abs(huv) * wu * wv + abs(hvv) * wv * wv)
+                    peak = a + slopes + bends
             out[y, x] = word
             most = max(most, peak)
     return most
