@@ -134,9 +134,10 @@ def row_sums(wide, ru, eu, columns, sums, tops):
 
 @jit_fast
 def window_sums(sums, tops, y, rv, out):
-    """Sums over the windows of one row of records, in ``out`` (7, columns): value times 1, du, dv, du^2, du dv,
-    dv^2; and the greatest value.
-    """  # fmt: skip
+    """Sums over the windows of one row of records, in ``out`` (7, columns).
+
+    Of the value times 1, du, dv, du^2, du dv, dv^2; and the greatest value.
+    """
     for k in range(7):
         for x in range(out.shape[1]):
             out[k, x] = np.float32(0.0)
