@@ -5,14 +5,12 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 
-from bimfit.config import Config, SearchConfig
-from bimfit.geometry.pose import Pose2D
-from bimfit.geometry.slice import Slice
+from bimfit.config import Config
 from bimfit.pipeline.accuracy import accuracy_table, joint_errors, table_text, time_text
 from bimfit.pipeline.compare import Cut
 from bimfit.pipeline.fit import fit_joint
@@ -20,7 +18,6 @@ from bimfit.pipeline.records import JointResult
 from bimfit.pipeline.samples import sample_model
 from bimfit.pipeline.simulate import designed, longest_open
 from bimfit.pipeline.survey import cut_joint, model_joints
-from bimfit.pipeline.targets import Targets, expected_viewpoint, make_targets, matched_edges
 from bimfit.simulation.accuracy import GapErrors, gap_errors
 from bimfit.simulation.motion import random_truth
 from bimfit.simulation.oracle import oracle_gap
@@ -31,7 +28,7 @@ from bimfit.simulation.truth import JointTruth
 Progress = Callable[[str, float], None]
 SUITES = {
     "accuracy": "bimfit.pipeline.bench:bench_accuracy",
-    "matcher": "bimfit.pipeline.bench:bench_matcher",
+    "matcher": "bimfit.pipeline.bench_matcher:bench_matcher",
     "matcher-3d": "bimfit.pipeline.bench:bench_space",
     "scan": "bimfit.pipeline.bench_scan:bench_scan",
     "bim": "bimfit.pipeline.bench_bim:bench_bim",
@@ -69,7 +66,7 @@ def bench_accuracy(joints: int, seed: int, progress: Progress) -> Bench:
     standardised: dict[str, list[tuple[float, float, float]]] = {"auto": [], "independent": []}
     times: list[JointResult] = []
     unflagged = dict.fromkeys(cases, 0)
-    for k, (truth, cut) in enumerate(_reference_joints(joints, seed)):
+    for k, (truth, cut) in enumerate(reference_joints(joints, seed)):
         progress("accuracy", k / joints)
         for name, (method, motion) in cases.items():
             fit = fit_joint(*cut, Config(), method=method, motion=motion, threads=1)
@@ -118,47 +115,6 @@ def _standardised(fit: JointResult, found: GapErrors) -> list[tuple[float, float
     return rows
 
 
-def bench_matcher(joints: int, seed: int, progress: Progress) -> Bench:
-    """The planar search: time, evaluations and misses beside other methods, and how it grows."""
-    from bimfit.registration.bench import bench_growth, bench_methods, bench_threads, table_figures
-
-    slices: list[Slice] = []
-    truth: list[Pose2D] = []
-    targets: Targets | None = None
-    for joint_truth, (_, sections, cut) in _reference_joints(joints, seed):
-        edges = matched_edges(sections[0], expected_viewpoint(cut[0], sections[0]), Config())
-        targets = targets or make_targets(edges, Config())
-        slices += list(cut)
-        truth += [station.common or Pose2D() for station in joint_truth.stations]
-    if targets is None:
-        raise ValueError("a bench needs at least one joint")
-    search = SearchConfig()
-    starts = _perturbed(truth, seed)
-    progress("methods", 0.1)
-    rows = bench_methods(
-        targets.combined, slices, search, starts=starts, truth=truth, most={"brute": 8, "mrcsm": 83}
-    )
-    small = dataclasses.replace(search, window=(0.0125, 0.0125, math.radians(6.0)))
-    progress("component window", 0.5)
-    rows += [
-        dataclasses.replace(row, suite="component window")
-        for row in bench_methods(targets.components[0], slices, small, ("grcsm",))
-    ]
-    progress("growth", 0.6)
-    rows += bench_growth(targets.combined, slices[:83], search, tolerances=(0.001, 0.0005))
-    progress("threads", 0.95)
-    threads = bench_threads(targets.combined, slices, search)
-    tables = table_figures(targets.combined)
-    data = {
-        "rows": [dataclasses.asdict(row) for row in rows],
-        "two_threads_over_one": threads,
-        "tables": tables,
-    }
-    lines = [_head(dataclasses.asdict(rows[0])), *(_line(dataclasses.asdict(row)) for row in rows)]
-    lines += [f"two threads over one: {threads:.2f}", *(str(figures) for figures in tables)]
-    return Bench("\n".join(lines), data)
-
-
 def bench_space(joints: int, seed: int, progress: Progress) -> Bench:
     """The search in six degrees of freedom beside ICP, G-ICP and FPFH + RANSAC; ``joints`` starts."""
     from bimfit.registration.bench_3d import bench_matcher_3d, bench_tables_3d
@@ -171,7 +127,7 @@ def bench_space(joints: int, seed: int, progress: Progress) -> Bench:
     return Bench("\n".join([f"tables: {tables}", _head(rows[0]), *(_line(row) for row in rows)]), data)
 
 
-def _reference_joints(joints: int, seed: int) -> Iterator[tuple[JointTruth, Cut]]:
+def reference_joints(joints: int, seed: int) -> Iterator[tuple[JointTruth, Cut]]:
     """Truth and cut of so many seeded joints of the reference scenario."""
     scenario = Scenario()
     model, found = model_joints(sample_model(REFERENCE), Config().joints)
@@ -180,16 +136,6 @@ def _reference_joints(joints: int, seed: int) -> Iterator[tuple[JointTruth, Cut]
     for k in range(seed, seed + joints):
         truth = random_truth(sections, scenario, k, joint_id=joint.id, elements=joint.elements)
         yield truth, cut_joint(model, joint, simulate_scan(sections, truth, scenario, k), Config())
-
-
-def _perturbed(truth: Sequence[Pose2D], seed: int) -> list[Pose2D]:
-    """Starts for local methods: 20 mm and 5 degrees off, in a random direction."""
-    rng = np.random.default_rng(seed)
-    bearings, senses = rng.uniform(0.0, 2.0 * math.pi, len(truth)), rng.choice([-1.0, 1.0], len(truth))
-    return [
-        Pose2D(p.u + 0.02 * math.cos(b), p.v + 0.02 * math.sin(b), p.theta + s * math.radians(5.0))
-        for p, b, s in zip(truth, bearings.tolist(), senses.tolist(), strict=True)
-    ]
 
 
 def _head(row: dict[str, Any]) -> str:

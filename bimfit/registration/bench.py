@@ -40,6 +40,8 @@ class BenchRow:
         Share whose score is under that of the proven search; NaN where there is nothing to compare.
     off_10mm : float
         Share more than 10 mm from the truth; NaN where no truth is known.
+    vs_icp : float
+        Median time over that of point-to-point ICP on the same slices in the same run.
     """
 
     suite: str
@@ -51,6 +53,7 @@ class BenchRow:
     proven: float = float("nan")
     missed: float = float("nan")
     off_10mm: float = float("nan")
+    vs_icp: float = float("nan")
 
 
 def time_matches(name: str, jobs: Sequence[Job], config: SearchConfig) -> tuple[list[MatchResult], Array]:
@@ -107,7 +110,8 @@ def bench_methods(
             pairs = zip(results, reference[:count], strict=True)
             missed = float(np.mean([r.score < best.score - SAME for r, best in pairs]))
         rows.append(_row("matcher", name, results, seconds, missed, truth))
-    return rows
+    icp = [row.median_ms for row in rows if row.name == "icp-point"]
+    return [dataclasses.replace(row, vs_icp=row.median_ms / icp[0]) for row in rows] if icp else rows
 
 
 def bench_growth(
@@ -143,6 +147,33 @@ def bench_growth(
             many.append(dataclasses.replace(s, points=drawn + rng.normal(0.0, 5e-4, drawn.shape), beams=None))
         rows.append(_growth_row(f"{count} points", target, many, config))
     return rows
+
+
+@dataclass(frozen=True)
+class Exactness:
+    """The proven search against every pose of the window, over the same slices.
+
+    ``scores_differ`` and ``poses_differ`` count slices; times are medians, ms.
+    """
+
+    slices: int
+    scores_differ: int
+    poses_differ: int
+    search_ms: float
+    brute_ms: float
+
+
+def bench_exactness(target: Target, slices: Sequence[Slice], config: SearchConfig) -> Exactness:
+    """Compare with brute force, score and pose."""
+    jobs = [(target, s, Pose2D()) for s in slices]
+    found, fast = time_matches("grcsm", jobs, config)
+    best, slow = time_matches("brute", jobs, config)
+    pairs = list(zip(found, best, strict=True))
+    return Exactness(
+        len(slices), sum(a.score != b.score for a, b in pairs),
+        sum(not np.array_equal(a.parameters, b.parameters) for a, b in pairs),
+        float(np.median(fast) * 1e3), float(np.median(slow) * 1e3),
+    )  # fmt: skip
 
 
 def bench_threads(target: Target, slices: Sequence[Slice], config: SearchConfig, threads: int = 2) -> float:

@@ -7,7 +7,13 @@ import numpy as np
 
 from bimfit.config import SearchConfig
 from bimfit.geometry.pose import Pose2D
-from bimfit.registration.bench import bench_growth, bench_methods, bench_threads, table_figures
+from bimfit.registration.bench import (
+    bench_exactness,
+    bench_growth,
+    bench_methods,
+    bench_threads,
+    table_figures,
+)
 from bimfit.registration.table import Target
 
 SMALL = SearchConfig(window=(0.02, 0.015, math.radians(6)), tolerance=(0.002, 0.002, math.radians(0.6)))
@@ -26,6 +32,9 @@ def test_rows_agree_with_one_another(scenes):
     assert rows["brute"].slices == 2 and rows["brute"].evaluations == 27**3
     assert rows["icp-point"].off_10mm == 1.0 and rows["grcsm"].off_10mm == 0.0
     assert all(r.median_ms <= r.p95_ms for r in rows.values())
+    assert rows["icp-point"].vs_icp == 1.0 and rows["grcsm"].vs_icp > 0.0
+    exact = bench_exactness(target, slices, SMALL)
+    assert (exact.slices, exact.scores_differ, exact.poses_differ) == (4, 0, 0)
     figures = table_figures(target)
     assert {f["bound"] for f in figures} == {"majorant", "overlap", "block"}
     assert all(f["mebibytes"] > 0 for f in figures)
