@@ -10,6 +10,8 @@ from bimfit.scan.cloud import PointCloud
 from bimfit.scan.formats.options import unit_name
 
 _MOST_PLACES = 3
+_MOST_MOVES = 10_000
+"""A sensor that moved more often is not looked at for places that it came back to."""
 _SAME_PLACE = 1e-6
 
 
@@ -45,10 +47,13 @@ def seen_from(origins: Array | None) -> str:
         return "sensor position unknown"
     rows = origins.reshape(-1, 3)
     move = np.flatnonzero((np.abs(np.diff(rows, axis=0)) > _SAME_PLACE).any(axis=1)) + 1
-    seen = np.unique(np.round(rows[np.r_[0, move]] / _SAME_PLACE), axis=0) * _SAME_PLACE
-    if len(seen) <= _MOST_PLACES:
-        return "seen from " + " and ".join(map(_at, seen))
-    return f"seen from {len(seen):,} places between {_at(rows.min(axis=0))} and {_at(rows.max(axis=0))}"
+    count = len(move) + 1
+    if count <= _MOST_MOVES:
+        seen = np.unique(np.round(rows[np.r_[0, move]] / _SAME_PLACE), axis=0) * _SAME_PLACE
+        count = len(seen)
+        if count <= _MOST_PLACES:
+            return "seen from " + " and ".join(map(_at, seen))
+    return f"seen from {count:,} places between {_at(rows.min(axis=0))} and {_at(rows.max(axis=0))}"
 
 
 def _at(point: Array) -> str:

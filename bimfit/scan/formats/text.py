@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import math
-import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
@@ -104,7 +103,7 @@ def _whole_lines(stream: BinaryIO) -> Iterator[bytes]:
         cut = block.rfind(b"\n") + 1
         rest = block[cut:]
         if cut:
-            yield block[:cut].replace(b"\r\n", b"\n")
+            yield block[:cut].replace(b"\r\n", b"\n") if b"\r" in block else block[:cut]
     if rest.strip():
         yield rest.replace(b"\r", b"") + b"\n"
 
@@ -146,29 +145,11 @@ def _quick(block: bytes, delimiter: str, width: int, wanted: list[int]) -> Array
     """Everything at once; None where a row or a cell needs a closer look."""
     if b'"' in block:
         return None
-    if delimiter != " ":
-        if b"_" in block:  # which float() takes for part of a number
-            return None
-        if b"\n\n" in block or block.startswith(b"\n"):
-            block = b"\n".join(line for line in block.split(b"\n") if line) + b"\n"
-        return parse_columns(block, ord(delimiter), width, wanted)
-    try:
-        text = block.decode("ascii")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # "input contained no data": blank lines alone
-            out = np.loadtxt(
-                io.StringIO(text),
-                delimiter=None if delimiter == " " else delimiter,
-                comments=None,
-                usecols=wanted if delimiter != " " else None,
-                ndmin=2,
-            )
-    except (ValueError, UnicodeDecodeError):
-        return None
-    if delimiter == " " and out.size:
-        # without usecols loadtxt itself insists that all rows are of one length
-        return np.asarray(out[:, wanted]) if out.shape[1] == width else None
-    return np.asarray(out.reshape(-1, len(wanted)))
+    if b"\n\n" in block or block.startswith(b"\n"):
+        block = b"\n".join(line for line in block.split(b"\n") if line) + b"\n"
+        if block == b"\n":
+            return np.zeros((0, len(wanted)))
+    return parse_columns(block, ord(delimiter), width, wanted)
 
 
 def _slow(
