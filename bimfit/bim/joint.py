@@ -115,4 +115,6 @@ class Joint:
             "two_sided": self.two_sided,
             "accessible": self.accessible,
             "filler": self.filler,
+            "closed": self.path.closed,
+            "legs": list(self.legs),
         }

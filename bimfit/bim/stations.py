@@ -156,7 +156,7 @@ def design_sections(
     tuple of JointSection
         In the order of the stations. A station at which a component is missing, as where an opening reaches
         the joint and the gap is far wider than ``joint.width`` (or, without one, than at most stations), is
-        left out; :func:`missing_stations` names those.
+        left out, as is one whose plane runs along the joint's other leg. :func:`missing_stations` names them.
 
     Raises
     ------
@@ -185,6 +185,10 @@ def design_sections(
     designed = getattr(joint, "width", None)
     usual = float(np.median(widths)) if designed is None else max(float(designed), 0.0)
     kept = widths <= 2.0 * usual + _WIDE
+    if len(joint.path.u) > 1 and not joint.path.curved:
+        # beside a corner a plane can run along the other leg's mouth: a hair off, it would show another gap
+        sizes = np.array([_size(section.gap) for section in found])
+        kept &= sizes <= 2.0 * max(float(np.median(sizes)), float(getattr(joint, "depth", 0.0))) + _WIDE
     return _shared([section for section, keep in zip(found, kept, strict=True) if keep])
 
 
@@ -207,6 +211,11 @@ def _width(gap: GapOutline) -> float:
     a, b = gap.mouth
     c, d = gap.root
     return float(min(np.linalg.norm(a - b), np.linalg.norm(c - d)))
+
+
+def _size(gap: GapOutline) -> float:
+    around = np.concatenate([gap.side_a, gap.side_b])
+    return float(np.linalg.norm(np.ptp(around, axis=0)))
 
 
 def _shared(sections: Sequence[JointSection]) -> tuple[JointSection, ...]:

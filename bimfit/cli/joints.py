@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -32,11 +32,18 @@ def run(
 
     building, joints = model_joints(model, joint_config(max_gap), choice)
     if as_json:
-        print(json.dumps([joint.to_dict() for joint in joints], indent=1, ensure_ascii=False))
+        names = {element.guid: element.name for element in building.elements}
+        print(json.dumps([_plain(joint, names) for joint in joints], indent=1, ensure_ascii=False))
     else:
         print("\n".join(_table(building, joints)))
     _tell_notes(building)
     return 0
+
+
+def _plain(joint: Joint, names: dict[str, str]) -> dict[str, Any]:
+    """The joint as plain values, with the names that the model gives its elements."""
+    filler = names.get(joint.filler) if joint.filler else None
+    return {**joint.to_dict(), "names": [names.get(guid) for guid in joint.elements], "filler_name": filler}
 
 
 def _table(model: Model, joints: tuple[Joint, ...]) -> list[str]:

@@ -20,7 +20,7 @@ from bimfit.geometry.line_scan import LineScan
 from bimfit.geometry.slice import Slice
 from bimfit.geometry.status import Status
 from bimfit.pipeline.fit import fit_station
-from bimfit.pipeline.survey import mouth_paths
+from bimfit.pipeline.mouth import mouth_paths, spine_stations
 from bimfit.pipeline.targets import TargetCache, Targets, match_reach, with_assumed_view
 from bimfit.scan.coverage import sweep_positions
 from bimfit.scan.grid import StationGrid
@@ -128,7 +128,8 @@ class LiveFit:
         found = sweep_positions(sweep, self._grid, self._mouth, NEAR)
         if not len(found):
             return math.nan
-        return float(np.interp(found[0], self._mouth.stops, self.joint.path.stops))
+        stations = spine_stations(self.joint.path, self._mouth, found[:1])
+        return float(stations[0]) if len(stations) else math.nan
 
     def fit_placed(self, index: int, sweep: LineScan) -> LiveStation:
         """Fit a sweep in model coordinates, which says itself where it is."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -15,11 +14,12 @@ from bimfit.config import Config
 from bimfit.errors import ScanError
 from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.line_scan import LineScan
-from bimfit.geometry.path import JointPath
 from bimfit.geometry.pose import Array
 from bimfit.geometry.slice import Slice
 from bimfit.pipeline.fit import check_choice, fit_joint
 from bimfit.pipeline.listing import model_joints as model_joints
+from bimfit.pipeline.mouth import mouth_paths as mouth_paths
+from bimfit.pipeline.mouth import spine_stations
 from bimfit.pipeline.placing import NEAR, Placed, Placing, joint_boxes, place_scan
 from bimfit.pipeline.profile_file import TaughtProfile
 from bimfit.pipeline.records import JointResult, SurveyResult
@@ -209,22 +209,6 @@ def fully_shown(cuts: Sequence[Cut], config: Config) -> tuple[list[Cut], str]:
     )
 
 
-def mouth_paths(joint: Joint) -> tuple[JointPath, JointPath]:
-    """The joint's path shifted from mid-gap to its mouth, and to its root, in case that is the side seen."""
-    return _shifted(joint.path, 0.5 * joint.depth), _shifted(joint.path, -0.5 * joint.depth)
-
-
-def _shifted(path: JointPath, distance: float) -> JointPath:
-    """A path shifted along v, its stations where they were; curved paths keep each leg's own v."""
-    v = np.concatenate([path.v[:1], 0.5 * (path.v[1:] + path.v[:-1]), path.v[-1:]])
-    if path.closed:
-        v[0] = v[-1] = 0.5 * (path.v[0] + path.v[-1])
-    try:
-        return dataclasses.replace(path, points=path.points + distance * v)
-    except ValueError:  # an arc tighter than the joint is deep
-        return path
-
-
 def cut_joint(
     elements: HasElements | Mapping[str, HasMesh], joint: Joint, scan: Scan, config: Config
 ) -> tuple[Joint, tuple[JointSection, ...], tuple[Slice, ...]]:
@@ -240,7 +224,7 @@ def cut_joint(
         joint = joint.facing(eye)
     mouth = mouth_paths(joint)[0]
     along = scan_stations(scan, mouth, config.slices.spacing)
-    stations = np.interp(along, mouth.stops, joint.path.stops)
+    stations = spine_stations(joint.path, mouth, along)
     sections = design_sections(elements, joint, stations) if len(stations) else ()
     if not sections:
         return joint, (), ()
