@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from bimfit.errors import ExportError
 from bimfit.files import protect_inputs, write_text
+from bimfit.pipeline.document import closest
 from bimfit.pipeline.records import JointResult, SurveyResult
 from bimfit.pipeline.results import stations_to_csv, survey_to_dict, to_json
 
@@ -138,9 +139,11 @@ def describe(joint: JointResult) -> str:
     for station in joint.stations:
         counts[station.status.name] = counts.get(station.status.name, 0) + 1
     statuses = ", ".join(f"{n} {name}" for name, n in sorted(counts.items()))
+    touching = {"clash": "; the elements overlap (clash)", "touch": "; the elements touch"}
+    near = touching.get(closest({gap.contact for gap in measured}), "")
     volume = "" if joint.volumes is None else f", volume {joint.volumes.mesh * 1e6:.1f} cm3"
     return (
         f"{joint.joint.id}: {joint.joint.kind}, designed {joint.joint.width * 1e3:.1f} mm, mouth "
         f"{min(widths):.1f} to {max(widths):.1f} mm (mean {sum(widths) / len(widths):.1f}){volume}; "
-        f"{len(joint.stations)} stations: {statuses}"
+        f"{len(joint.stations)} stations: {statuses}{near}"
     )

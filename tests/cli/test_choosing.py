@@ -41,7 +41,7 @@ def test_every_command_takes_the_same_choice(samples, tmp_path, capsys):
     assert main(["joints", model, "--json", *choice]) == 0
     wanted = [joint["id"] for joint in json.loads(capsys.readouterr().out)]
     assert len(wanted) == 3
-    (tmp_path / "coarse.toml").write_text("spacing = 0.5\n")
+    (tmp_path / "coarse.toml").write_text("spacing = 1.0\n")
     words = ["--scenario", str(tmp_path / "coarse.toml"), "--truth", str(tmp_path / "truth.json")]
     assert main(["simulate", model, *choice, *words, "-o", scan]) == 0
     assert [joint["id"] for joint in json.loads((tmp_path / "truth.json").read_text())["joints"]] == wanted

@@ -39,7 +39,7 @@ AROUND = [
 small = st.tuples(*[st.floats(-0.02, 0.02)] * 3)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(small, small)
 def test_a_motion_seen_all_around_is_found(shift, turn):
     T = motion(np.array(shift), np.array(turn))
