@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from bimfit.pipeline import bench_sensor
+from bimfit.pipeline import bench_sensor, bench_size
 from bimfit.pipeline.bench_sensor import Figures, Progress
 
 ROWS: tuple[tuple[str, Callable[[int, Progress], Figures]], ...] = (
+    ("size", bench_size.size),
     ("latency", bench_sensor.latency),
     ("fuzz", bench_sensor.fuzz),
     ("faults", bench_sensor.faults),

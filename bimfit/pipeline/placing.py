@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -133,9 +133,11 @@ def place_scan(
     still = np.eye(4) if placing.pose is None or placing.trajectory is not None else placing.pose
     moves = {name: T @ still for name, T in frames.items()}
     gatherers = {name: Gatherer(places) for name in moves}
-    for piece in _pieces(path, placing, _in_file(places, moves.values())):
+    own = {name: places.moved(similarity_inverse(T)) for name, T in moves.items()}
+    wanted = Boxes(np.concatenate([boxes.array for boxes in own.values()]))
+    for piece in _pieces(path, placing, wanted):
         for name, T in moves.items():
-            _show(gatherers[name], piece, T)
+            _show(gatherers[name], piece, T, own[name])
     found = {name: gatherer.done() for name, gatherer in gatherers.items()}
     counts = {name: nearby.returns for name, nearby in found.items()}
     best = max(counts, key=lambda name: counts[name])
@@ -196,12 +198,6 @@ def similarity_inverse(T: Array) -> Array:
     return out
 
 
-def _in_file(places: Boxes, moves: Iterable[Array]) -> Boxes:
-    """The places in the file's coordinates, in whichever frame these are."""
-    each = [places.moved(similarity_inverse(T)) for T in moves]
-    return Boxes(np.concatenate([boxes.array for boxes in each]))
-
-
 def _pieces(path: Path, placing: Placing, boxes: Boxes | None) -> Iterator[Scan]:
     from bimfit.scan.formats import scan_chunks
 
@@ -210,8 +206,8 @@ def _pieces(path: Path, placing: Placing, boxes: Boxes | None) -> Iterator[Scan]
     for piece in read_ahead(scan_chunks(path, options)):
         if placing.trajectory is not None:
             yield _along(path, piece, placing.trajectory, placing.pose)
-            continue
-        yield _only(piece, boxes) if boxes is not None and isinstance(piece, PointCloud) else piece
+        else:
+            yield piece
 
 
 def _along(path: Path, piece: Scan, trajectory: Trajectory, mount: Array | None) -> LineScan:
@@ -224,17 +220,18 @@ def _along(path: Path, piece: Scan, trajectory: Trajectory, mount: Array | None)
     return trajectory.carry(piece if mount is None else piece.transformed(mount))
 
 
-def _only(cloud: PointCloud, boxes: Boxes) -> PointCloud:
-    """The bare points of a cloud that lie in boxes."""
-    index, _ = boxes.find(*cloud.points.T)
-    return PointCloud(cloud.points[index], cloud.viewpoint, source=cloud.source, notes=cloud.notes)
-
-
-def _show(gatherer: Gatherer, piece: Scan, T: Array) -> None:
+def _show(gatherer: Gatherer, piece: Scan, T: Array, own: Boxes) -> None:
+    """Show a piece to whoever gathers, carried by T; of a cloud only the bare points that lie in ``own``."""
+    if isinstance(piece, LineScan):
+        gatherer.add(piece if np.array_equal(T, np.eye(4)) else moved(piece, T))
+        return
+    index, _ = own.find(*piece.points.T)
+    points = piece.points[index]
+    part = PointCloud(points, piece.viewpoint, source=piece.source, notes=piece.notes)
     if np.array_equal(T, np.eye(4)):
-        gatherer.add(piece)
+        gatherer.add(part)
     else:
-        gatherer.add(moved(piece, T), piece.points if isinstance(piece, PointCloud) else None)
+        gatherer.add(moved(part, T), points)
 
 
 def _choice_note(best: str, counts: dict[str, int], model: Model) -> str:

@@ -32,15 +32,20 @@ def naive(boxes: np.ndarray, points: np.ndarray) -> np.ndarray:
     count=st.integers(1, 40),
     size=st.sampled_from([0.0, 0.05, 1.0, 30.0]),
     away=st.sampled_from([0.0, 1e3, 5e6]),
+    apart=st.sampled_from([0.0, 5e6]),
 )
-def test_boxes_keep_just_what_lies_in_one(seed: int, count: int, size: float, away: float) -> None:
+def test_boxes_keep_just_what_lies_in_one(
+    seed: int, count: int, size: float, away: float, apart: float
+) -> None:
     rng = np.random.default_rng(seed)
     corners = rng.uniform(-10, 10, (count, 1, 3)) + away
     array = corners + rng.uniform(-1, 1, (count, 2, 3)) * size
+    array[::3, :, 1] += apart  # the same places in other coordinates
     boxes = Boxes.of(array)
     points = np.concatenate(
         [
             rng.uniform(-12, 12, (300, 3)) + away,
+            rng.uniform(-12, 12, (100, 3)) + away + np.array([0.0, apart, 0.0]),
             boxes.array.reshape(-1, 3),  # corners belong to their box
             boxes.array.mean(axis=1),
             [[np.nan, away, away], [np.inf, away, away]],
