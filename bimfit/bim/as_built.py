@@ -39,7 +39,8 @@ class AsBuiltGap:
     designed_width : float
         m.
     contact : str
-        How close the components come: ``clear``, ``touch`` or ``clash``; empty where not known.
+        How close the components come: ``clear``, ``touch``, ``possible clash``, ``clash``; empty where not
+        known.
     width_min, width_mean, width_max, width_sigma : float or None
         Width of the mouth along the joint and the standard deviation of its estimate, m; negative where the
         components overlap.

@@ -93,7 +93,7 @@ def as_built_gap(result: JointResult) -> AsBuiltGap:
         reason=""
         if not flagged
         else f"{flagged} of {len(result.stations)} stations are not ok; see results.json",
-        contact=closest({gap.contact for gap in gaps}),
+        contact=closest(station.nearness for station in trusted),
         width_min=float(widths.min()),
         width_mean=float(widths.mean()),
         width_max=float(widths.max()),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,8 @@ from bimfit.errors import ConfigError
 from bimfit.geometry.pose import Array
 
 NAME = "results.json"
+SURE = 2.0
+"""A figure is beyond doubt when it lies this many standard deviations off."""
 TRUSTED = ("ok", "weak")
 """A station of another status has no figures that a verdict could rest on."""
 
@@ -126,7 +128,7 @@ class JointDocument:
     @property
     def contact(self) -> str:
         """The closest that the two components come as built, see :func:`closest`."""
-        return closest({station.contact for station in self.trusted})
+        return closest((one.contact, one.narrowest, one.sigma_narrowest) for one in self.trusted)
 
     @property
     def storey(self) -> str:
@@ -157,10 +159,22 @@ class ResultsDocument:
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
-def closest(contacts: Collection[str]) -> str:
-    """The closest that two components come: ``clash`` (they overlap), ``touch``, ``clear``, or nothing."""
-    names = {"overlap": "clash", "touch": "touch", "clearance": "clear"}
-    return next((names[name] for name in names if name in contacts), "")
+def closest(gaps: Iterable[tuple[str, float, float]]) -> str:
+    """The closest that two components come, of (contact, narrowest width, its deviation; m) a station.
+
+    Returns
+    -------
+    str
+        ``clash`` where they overlap beyond doubt, ``possible clash`` where the uncertainty excuses it,
+        ``touch``, ``clear``, or nothing without a station.
+    """
+    found = {
+        "possible clash"
+        if contact == "overlap" and -narrowest <= SURE * sigma
+        else {"overlap": "clash", "touch": "touch", "clearance": "clear"}.get(contact, "")
+        for contact, narrowest, sigma in gaps
+    }
+    return next((name for name in ("clash", "possible clash", "touch", "clear") if name in found), "")
 
 
 def read_results(folder: Path) -> ResultsDocument:

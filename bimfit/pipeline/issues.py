@@ -16,9 +16,9 @@ from bimfit.errors import BimfitError, ConfigError
 from bimfit.files import protect_inputs
 from bimfit.geometry.mesh import TriangleMesh
 from bimfit.geometry.pose import Array
-from bimfit.pipeline.document import JointDocument, ResultsDocument
+from bimfit.pipeline.document import SURE, JointDocument, ResultsDocument
 from bimfit.pipeline.gap_files import load_gap
-from bimfit.pipeline.limits import SURE, Limits, Verdict, judge, values
+from bimfit.pipeline.limits import Limits, Verdict, judge, values
 from bimfit.report.limit_plots import LimitSeries, plot_limits
 from bimfit.report.scene import JointScene, View, render_joint
 

@@ -11,12 +11,10 @@ import numpy as np
 
 from bimfit.errors import ConfigError
 from bimfit.geometry.pose import Array
-from bimfit.pipeline.document import JointDocument, StationDocument
+from bimfit.pipeline.document import SURE, JointDocument, StationDocument
 
 Range = tuple[float, float]
 Outcome = Literal["pass", "fail", "not measured", ""]
-SURE = 2.0
-"""A figure is beyond doubt when it lies this many standard deviations off the limit."""
 LEAST_MEASURED = 0.5
 """A joint passes only where at least this share of its stations was measured."""
 _WORDS = {

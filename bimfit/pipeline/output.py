@@ -139,11 +139,16 @@ def describe(joint: JointResult) -> str:
     for station in joint.stations:
         counts[station.status.name] = counts.get(station.status.name, 0) + 1
     statuses = ", ".join(f"{n} {name}" for name, n in sorted(counts.items()))
-    touching = {"clash": "; the elements overlap (clash)", "touch": "; the elements touch"}
-    near = touching.get(closest({gap.contact for gap in measured}), "")
+    touching = {
+        "clash": "; the elements overlap (clash)",
+        "possible clash": "; the elements may overlap (possible clash)",
+        "touch": "; the elements touch",
+    }
+    near = touching.get(closest(station.nearness for station in joint.stations), "")
     volume = "" if joint.volumes is None else f", volume {joint.volumes.mesh * 1e6:.1f} cm3"
+    designed = round(joint.joint.width * 1e3, 1) + 0.0  # never -0.0
     return (
-        f"{joint.joint.id}: {joint.joint.kind}, designed {joint.joint.width * 1e3:.1f} mm, mouth "
+        f"{joint.joint.id}: {joint.joint.kind}, designed {designed:.1f} mm, mouth "
         f"{min(widths):.1f} to {max(widths):.1f} mm (mean {sum(widths) / len(widths):.1f}){volume}; "
         f"{len(joint.stations)} stations: {statuses}{near}"
     )

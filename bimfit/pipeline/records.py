@@ -91,6 +91,14 @@ class StationResult:
     seconds: float = 0.0
 
     @property
+    def nearness(self) -> tuple[str, float, float]:
+        """Contact, narrowest width and its deviation, m; an empty contact where there is no gap."""
+        if self.gap is None:
+            return "", float("nan"), float("nan")
+        sigma = float("nan") if self.gap.sigma is None else self.gap.sigma.width_narrowest
+        return self.gap.contact, self.gap.width_narrowest, sigma
+
+    @property
     def step(self) -> Step | None:
         """How flush the two components are at the mouth; None where that is not known."""
         from bimfit.gap.step import gap_step

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bimfit.files import protect_inputs
-from bimfit.pipeline.document import JointDocument, ResultsDocument, StationDocument
+from bimfit.pipeline.document import SURE, JointDocument, ResultsDocument, StationDocument
 from bimfit.pipeline.gap_files import load_gap
 from bimfit.pipeline.issues import joint_elements, limit_series
-from bimfit.pipeline.limits import SURE, Limits, Verdict, judge
+from bimfit.pipeline.limits import Limits, Verdict, judge
 from bimfit.pipeline.output import PICTURES, safe_name
 from bimfit.report.html import (
     Cell,
@@ -183,7 +183,7 @@ def _step(joint: JointDocument) -> float:
 
 
 def _text(value: float, digits: int = 1) -> str:
-    return f"{value:.{digits}f}" if math.isfinite(value) else _NONE
+    return f"{round(value, digits) + 0.0:.{digits}f}" if math.isfinite(value) else _NONE
 
 
 def _cells(joint: JointDocument, names: str) -> list[Cell]:
@@ -206,9 +206,14 @@ def _figures(joint: JointDocument) -> list[tuple[str, str]]:
     if math.isfinite(joint.volume_sigma):
         volume += f" ± {SURE * 1e3 * joint.volume_sigma:.3f}"
     narrowest = min((station.narrowest for station in joint.trusted), default=math.nan)
-    touching = {"clash": "the elements overlap (clash)", "touch": "the elements touch", "clear": "clear"}
+    touching = {
+        "clash": "the elements overlap (clash)",
+        "possible clash": "may overlap (possible clash)",
+        "touch": "the elements touch",
+        "clear": "clear",
+    }
     rows = [
-        ("designed width", f"{1e3 * joint.width:.1f} mm"),
+        ("designed width", f"{_text(1e3 * joint.width)} mm"),
         ("mean width at the mouth", f"{_text(mean)} mm"),
         ("… known at a station to", f"± {_text(spread)} mm"),
         ("width from … to", f"{_text(low)} … {_text(high)} mm"),

@@ -14,8 +14,8 @@ import numpy as np
 
 from bimfit.errors import ExportError
 from bimfit.files import whole_file, write_text
-from bimfit.pipeline.document import JointDocument, ResultsDocument
-from bimfit.pipeline.limits import SURE, Limits, Verdict, judge
+from bimfit.pipeline.document import SURE, JointDocument, ResultsDocument
+from bimfit.pipeline.limits import Limits, Verdict, judge
 
 NAMES = ("schedule.csv", "schedule.xlsx")
 
@@ -145,7 +145,10 @@ def _csv(rows: Sequence[Sequence[str | float | int | None]]) -> str:
     writer.writerow([column.heading for column in COLUMNS])
     for row in rows:
         writer.writerow(
-            ["" if v is None else f"{v:.6g}" if isinstance(v, float) else _harmless(v) for v in row]
+            [
+                "" if v is None else f"{round(v, 6) + 0.0:.6g}" if isinstance(v, float) else _harmless(v)
+                for v in row
+            ]
         )
     return text.getvalue()
 

@@ -14,7 +14,7 @@ import pytest
 
 from bimfit.cli.limits import read_limits
 from bimfit.errors import ConfigError
-from bimfit.pipeline.document import read_results
+from bimfit.pipeline.document import closest, read_results
 from bimfit.pipeline.limits import Limits, judge
 from bimfit.pipeline.schedule import COLUMNS, write_schedule
 
@@ -63,6 +63,17 @@ def test_a_breach_within_the_uncertainty_says_so(tmp_path):
     verdicts = judged(tmp_path, [joint("close", [station(0.1 * k, 0.0295, sigma=0.001) for k in range(4)])])
     assert verdicts["close"].outcome == "pass"
     assert "4 figures lie within their uncertainty" in verdicts["close"].reason
+
+
+def test_an_overlap_is_a_clash_only_beyond_doubt():
+    clear, touch = ("clearance", 0.004, 0.001), ("touch", 0.0, 0.001)
+    doubtful, sure = ("overlap", -0.0019, 0.001), ("overlap", -0.0021, 0.001)
+    assert closest([]) == closest([("", math.nan, math.nan)]) == ""
+    assert closest([clear, clear]) == "clear"
+    assert closest([clear, touch]) == "touch"
+    assert closest([touch, doubtful, clear]) == "possible clash"
+    assert closest([sure, doubtful, clear]) == "clash"
+    assert closest([("overlap", -1e-4, math.nan)]) == "clash"  # nothing excuses it
 
 
 @pytest.mark.parametrize(
