@@ -34,7 +34,7 @@ def run(
     ),
     speed: str | None = typer.Option(None, "--speed", help="Of the sensor along the joint, m/s."),
     replay: Path | None = typer.Option(
-        None, "--replay", metavar="FILE", help="A recorded line scan instead of a sensor."
+        None, "--replay", metavar="FILE", help="A recorded line scan or SCIP dialogue instead of a sensor."
     ),
     start: str = typer.Option("0", "--start", help="Where along the joint the first sweep is, such as 10mm."),
     height: str = typer.Option("0.25", "--height", help="Of the sensor over the designed mouth."),
@@ -58,7 +58,11 @@ def run(
     config: Path | None = typer.Option(None, "--config", metavar="FILE.toml", help="Settings."),
     as_json: bool = typer.Option(False, "--json", help="Print a JSON object a sweep."),
 ) -> int:
-    """Fit each sweep of a sensor as it comes, a line a sweep, until the joint's end or until interrupted."""
+    """Fit each sweep of a sensor as it comes, a line a sweep, until the joint's end or until interrupted.
+
+    A line has the place along the joint, the mouth's width with its sigma, the offset of its middle across
+    (u) and out of the mouth (v), its angle, and the status.
+    """
     from bimfit.pipeline.carriage import Mount
     from bimfit.pipeline.live import Live
     from bimfit.scan.trajectory import read_tum

@@ -174,7 +174,7 @@ def model_emulation(
             )
     first = held_over(sections[0], scenario.sensor_height)
     start = advanced(first, np.array([-sections[0].s]))[0]
-    way = f"{sections[-1].s:.3f} m at {speed:g} m/s and back"
+    way = f"{sections[-1].s:.3f} m at {speed:g} m/s and back, {scenario.sensor_height:g} m over it"
     about = f"joint {chosen.id} of {model_path.name}, {way}, seed {seed}"
     return Emulation(MovingScene(ride.ranges), about, start, truth)
 

@@ -442,3 +442,21 @@ def test_windows_has_no_emulator(monkeypatch):
     monkeypatch.setattr(os, "name", "nt")
     with pytest.raises(SensorError, match="Windows"):
         device.start()
+
+
+ELSEWHERE = """
+import signal, sys
+for name in ("fcntl", "termios", "pty", "tty", "grp", "pwd"):
+    sys.modules[name] = None  # as on Windows
+del signal.SIGHUP
+import bimfit.cli.main, bimfit.pipeline.capture, bimfit.pipeline.emulate, bimfit.pipeline.live
+import bimfit.sensor.emulator, bimfit.sensor.hokuyo
+print("imported")
+"""
+
+
+def test_all_of_it_is_imported_where_there_are_no_pseudo_terminals():
+    done = subprocess.run(
+        [sys.executable, "-c", ELSEWHERE], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert done.stdout == "imported\n", done.stderr
