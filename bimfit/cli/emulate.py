@@ -93,11 +93,13 @@ def _announce(port: str, served: Emulation) -> None:
     # the rest goes to stderr: a script may take one line and close the pipe
     print(f"serves {served.about}; Ctrl-C ends it", file=sys.stderr)
     if served.T_world_sensor is not None:
+        import numpy as np
         from scipy.spatial.transform import Rotation
 
         T = served.T_world_sensor
         numbers = [*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_rotvec()]
-        text = ",".join(f"{x if abs(x) > 1e-12 else 0.0:.9g}" for x in numbers)
+        # whole micrometres also at map coordinates
+        text = ",".join(f"{x + 0.0:.9f}".rstrip("0").rstrip(".") for x in np.round(numbers, 9))
         print(f"starts at --scan-pose {text}", file=sys.stderr, flush=True)
 
 

@@ -210,6 +210,20 @@ def test_the_recorded_dialogue_over_a_real_port(shared):
     assert told(heard)[1] == 3
 
 
+def test_the_start_is_told_to_the_micrometre_at_map_coordinates(capsys):
+    from bimfit.cli.emulate import _announce
+    from bimfit.pipeline.emulate import Emulation
+
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec([1.2, -0.3, 2.1]).as_matrix()
+    T[:3, 3] = [458657.123456, 5438232.654321, -0.0]
+    _announce("port", Emulation([], "nothing", T))
+    out, said = capsys.readouterr()
+    told = said.splitlines()[-1].removeprefix("starts at --scan-pose ")
+    assert out == "port\n" and told.startswith("458657.123456,5438232.654321,0,")
+    np.testing.assert_allclose(read_pose(told), T, rtol=0.0, atol=2e-8)
+
+
 def recorded(path):
     data, records, at = path.read_bytes(), [], 0
     while at < len(data):
