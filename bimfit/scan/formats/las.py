@@ -21,6 +21,7 @@ from bimfit.scan.formats.packed import COARSE
 from bimfit.scan.formats.text import first_lines
 
 _CHUNK = 500_000
+_BLOCK = 1 << 15
 _STEP = 1e-4
 
 
@@ -62,16 +63,49 @@ def las_chunks(path: Path, options: ReadOptions) -> Iterator[PointCloud]:
         header = reader.header
         scale, offset = np.asarray(header.scales, float), np.asarray(header.offsets, float)
         notes = step_note(scale, options)
-        for chunk in reader.chunk_iterator(_CHUNK):
-            seen += len(chunk)
-            piece = las_piece(path, chunk, scale, offset, boxes, notes)
-            good += len(chunk) if boxes is not None else len(piece)
-            yield piece
         count = int(header.point_count)
+        if boxes is not None and not header.are_points_compressed:
+            for number, record in _plain_records(path, header, boxes):
+                seen += number
+                yield las_piece(path, record, scale, offset, None, notes)
+            good = seen
+        else:
+            for chunk in reader.chunk_iterator(_CHUNK):
+                seen += len(chunk)
+                piece = las_piece(path, chunk, scale, offset, boxes, notes)
+                good += len(chunk) if boxes is not None else len(piece)
+                yield piece
     if seen and seen < count:
         raise ScanError(f"cut short: {seen} of {count} points", file=path)
     if not good:
         raise ScanError("the file holds no point", file=path)
+
+
+def _plain_records(path: Path, header: Any, boxes: Boxes) -> Iterator[tuple[int, Any]]:
+    """The records of an uncompressed file that lie in boxes, and how many were looked at for each piece.
+
+    They pass through one buffer that fits the processor's cache, which takes a fraction of the time that
+    making an array of each chunk does.
+    """
+    from laspy import ScaleAwarePointRecord
+
+    scale, offset = np.asarray(header.scales, float), np.asarray(header.offsets, float)
+    buffer = np.empty(_BLOCK, header.point_format.dtype())
+    width = buffer.itemsize
+    room: Any = buffer.view(np.uint8)
+    left = int(header.point_count)
+    with path.open("rb", buffering=0) as stream:
+        stream.seek(int(header.offset_to_point_data))
+        while left > 0:
+            kept, seen = [buffer[:0]], 0
+            while seen < _CHUNK and left > 0:
+                number = (stream.readinto(room[: min(_BLOCK, left, _CHUNK - seen) * width]) or 0) // width
+                raw = buffer[:number]
+                kept.append(raw[boxes.find(raw["X"], raw["Y"], raw["Z"], scale, offset)[0]])
+                seen += number
+                # nothing more where records are still to come: the file is cut short
+                left = left - number if number else 0
+            yield seen, ScaleAwarePointRecord(np.concatenate(kept), header.point_format, scale, offset)
 
 
 def check_records(path: Path) -> None:
