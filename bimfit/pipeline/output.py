@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import statistics
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -130,14 +132,15 @@ def _earlier_files(folder: Path) -> set[Path]:
 
 
 def describe(joint: JointResult) -> str:
-    """One line on a joint, for the terminal."""
-    measured = [s.gap for s in joint.stations if s.gap is not None]
+    """One line on a joint, for the terminal; widths are of the stations that are ok, where there are any."""
+    measured = [s for s in joint.stations if s.gap is not None]
     if not measured:
         return f"{joint.joint.id}: not estimated: {joint.reason}"
-    widths = [gap.width_mouth * 1e3 for gap in measured]
-    counts: dict[str, int] = {}
-    for station in joint.stations:
-        counts[station.status.name] = counts.get(station.status.name, 0) + 1
+    gaps = [s.gap for s in measured if s.status.name == "ok"] or [s.gap for s in measured]
+    widths = [gap.width_mouth * 1e3 for gap in gaps if gap is not None]
+    sigmas = [gap.sigma.width * 1e3 for gap in gaps if gap is not None and gap.sigma is not None]
+    plus_minus = f", sd {statistics.median(sigmas):.2f}" if sigmas else ""
+    counts = Counter(station.status.name for station in joint.stations)
     statuses = ", ".join(f"{n} {name}" for name, n in sorted(counts.items()))
     touching = {
         "clash": "; the elements overlap (clash)",
@@ -147,8 +150,9 @@ def describe(joint: JointResult) -> str:
     near = touching.get(closest(station.nearness for station in joint.stations), "")
     volume = "" if joint.volumes is None else f", volume {joint.volumes.mesh * 1e6:.1f} cm3"
     designed = round(joint.joint.width * 1e3, 1) + 0.0  # never -0.0
+    mean = f"mean {statistics.fmean(widths):.1f}{plus_minus}"
     return (
         f"{joint.joint.id}: {joint.joint.kind}, designed {designed:.1f} mm, mouth "
-        f"{min(widths):.1f} to {max(widths):.1f} mm (mean {sum(widths) / len(widths):.1f}){volume}; "
+        f"{min(widths):.1f} to {max(widths):.1f} mm ({mean}){volume}; "
         f"{len(joint.stations)} stations: {statuses}{near}"
     )
