@@ -30,6 +30,9 @@ def run(
     methods: str | None = typer.Option(
         None, "--methods", metavar="A,B,...", help="Which methods; default: all."
     ),
+    paper: bool = typer.Option(
+        False, "--paper", help="Add the method as printed; without --methods, beside grcsm alone."
+    ),
     truth: Path | None = typer.Option(
         None, "--truth", metavar="FILE", help="Truth to measure errors against."
     ),
@@ -45,6 +48,8 @@ def run(
         if methods is None
         else tuple(name.strip() for name in methods.split(",") if name.strip())
     )
+    if paper:
+        names = ("grcsm", "paper") if methods is None else (*(n for n in names if n != "paper"), "paper")
     settings = build_config(config, spacing=spacing)
     check_folder(output)
     with terminal_progress() as progress:

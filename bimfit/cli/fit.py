@@ -14,6 +14,7 @@ from bimfit.cli.limits import read_limits
 from bimfit.cli.options import build_config
 from bimfit.cli.placing import placing
 from bimfit.cli.progress import terminal_progress
+from bimfit.errors import ConfigError
 
 if TYPE_CHECKING:
     from bimfit.bim.selection import Selection
@@ -37,6 +38,11 @@ def run(
         "auto",
         "--motion",
         help="Motion along the joint: auto, independent, const, rigid, linear, smooth, kinked.",
+    ),
+    paper: bool = typer.Option(
+        False,
+        "--paper",
+        help="The method as printed: whole outlines, block tables, grid answers, no smoothing.",
     ),
     window: str | None = typer.Option(
         None, "--window", metavar="U,V,THETA", help="Half widths, such as 121.5mm,121.5mm,45deg."
@@ -79,6 +85,10 @@ def run(
     from bimfit.pipeline.profile_file import read_profile
     from bimfit.pipeline.survey import survey
 
+    if paper:
+        if method not in ("grcsm", "paper"):
+            raise ConfigError(f"--paper and --method {method} are two methods", remedy="give one of them")
+        method = "paper"
     settings = build_config(
         config,
         window=window,

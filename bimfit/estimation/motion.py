@@ -26,6 +26,36 @@ _FEW = 3
 
 
 @dataclass(frozen=True)
+class Coupling:
+    """How the errors of one component's stations hang together under a model of its motion.
+
+    Attributes
+    ----------
+    basis : Basis
+    spread : ndarray, shape (free, free)
+        Covariance of the model's coefficients, what the stations share included.
+    corner : ndarray, shape (n, 2)
+        The reference corner as designed.
+    """
+
+    basis: Basis
+    spread: Array
+    corner: Array
+
+    def between(self, gradients: Array, poses: Sequence[Pose2D | None]) -> Array:
+        """Covariance (n, n) of one figure a station, given its gradient (n, 3) by (u, v, theta) of the pose.
+
+        Zero where there is no pose.
+        """
+        rows = np.zeros((len(gradients), 3))
+        for i, pose in enumerate(poses):
+            if pose is not None:
+                rows[i] = np.linalg.solve(at_corner(pose, self.corner[i]).T, gradients[i])
+        H = (self.basis.functions[:, :, None] * rows[:, None, :])[:, self.basis.moves]
+        return np.asarray(H @ self.spread @ H.T)
+
+
+@dataclass(frozen=True)
 class JointEstimate:
     """All stations of a joint, estimated together.
 
@@ -41,6 +71,8 @@ class JointEstimate:
         Stations' distances along the joint at which the ``kinked`` model bends, m.
     outliers : tuple of (int, str)
         Stations that disagree with their neighbours, and which component does.
+    couplings : tuple of two Coupling, or None
+        Of A and B; None where every station stands for itself.
     """
 
     stations: tuple[StationEstimate, ...]
@@ -48,6 +80,7 @@ class JointEstimate:
     criterion: dict[str, float] = field(default_factory=dict)
     knots: Array = field(default_factory=lambda: np.zeros(0))
     outliers: tuple[tuple[int, str], ...] = ()
+    couplings: tuple[Coupling, Coupling] | None = None
 
 
 def estimate_joint(
@@ -102,7 +135,12 @@ def estimate_joint(
         trend.with_shared_cells(p, b, t) for p, b, t in zip(parts, bases[chosen], fits[chosen], strict=True)
     )
     out, outliers = _apply(stations, sections, parts, (fitted[0], fitted[1]))
-    return JointEstimate(out, chosen, criterion, knots if chosen == "kinked" else np.zeros(0), outliers)
+    couplings = tuple(
+        Coupling(b, t.spread, np.array([section.gap.mouth[which] for section in sections]))
+        for which, (b, t) in enumerate(zip(bases[chosen], fitted, strict=True))
+    )
+    bent = knots if chosen == "kinked" else np.zeros(0)
+    return JointEstimate(out, chosen, criterion, bent, outliers, (couplings[0], couplings[1]))
 
 
 def _fit_pair(parts: tuple[Sites, Sites], bases: tuple[Basis, Basis]) -> tuple[Trend, Trend]:

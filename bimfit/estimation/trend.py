@@ -69,7 +69,7 @@ class Trend:
     freedom : float
         Effective number of parameters.
     spread : ndarray, shape (free, free)
-        Covariance of the coefficients.
+        Covariance of the coefficients that are free.
     """
 
     value: Array
@@ -258,10 +258,11 @@ def with_shared_cells(sites: Sites, basis: Basis, trend: Trend) -> Trend:
     pull = sites.precision[k, :, 0] * trend.weight[k, None]
     R = np.einsum("ik,ia->kai", basis.functions[k], pull).reshape(-1, len(k))
     G = trend.spread @ R[basis.moves.ravel()]
-    extra = _blocks((G * s) @ rho @ (G * s).T, basis)
-    values, axes = np.linalg.eigh(extra)
-    extra = np.einsum("iab,ib,icb->iac", axes, np.maximum(values, 0.0), axes)
-    return replace(trend, covariance=trend.covariance + extra)
+    shared = (G * s) @ rho @ (G * s).T
+    values, axes = np.linalg.eigh(shared)
+    shared = (axes * np.maximum(values, 0.0)) @ axes.T
+    extra = _blocks(shared, basis)
+    return replace(trend, covariance=trend.covariance + extra, spread=trend.spread + shared)
 
 
 class Evidence:

@@ -275,6 +275,15 @@ def _propagate(
     return GapSigma(x, y, angle, width, area, width_root, narrowest)
 
 
+def area_gradient(outline: GapOutline, pose_a: Pose2D, pose_b: Pose2D) -> Array:
+    """Gradient of the area between the sides by (u, v, theta) of both poses, shape (6,), m^2 a m or rad.
+
+    That of the shoelace area, which is the open one while the sides clear each other.
+    """
+    a, b = _moved(outline.side_a.tolist(), pose_a), _moved(outline.side_b.tolist(), pose_b)
+    return np.array(_area_row(a, b, (pose_a, pose_b)))
+
+
 def _area_row(a: list[Point], b: list[Point], poses: tuple[Pose2D, Pose2D]) -> list[float]:
     """Gradient of the shoelace area: each vertex weighs half its neighbours' chord, turned."""
     ring = [*a, *reversed(b)]

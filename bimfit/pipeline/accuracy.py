@@ -24,7 +24,7 @@ def gap_estimate(gap: GapSection | None) -> GapEstimate | None:
     """What is compared with the truth at one station."""
     if gap is None:
         return None
-    return GapEstimate(gap.frame, gap.origin_world, gap.angle, gap.area)
+    return GapEstimate(gap.frame, gap.origin_world, gap.angle, gap.area, gap.width_mouth)
 
 
 def joint_errors(joint: JointResult, truth: JointTruth) -> GapErrors:

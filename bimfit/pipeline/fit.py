@@ -25,7 +25,7 @@ from bimfit.geometry.slice import Slice
 from bimfit.geometry.status import Status
 from bimfit.pipeline.records import ComponentResult, JointResult, StationResult
 from bimfit.pipeline.shape import StationShape, free_shapes, freedoms, judged, with_shape_sigma
-from bimfit.pipeline.stitch import stitch
+from bimfit.pipeline.stitch import area_correlation, stitch
 from bimfit.pipeline.targets import (
     COMBINED_BREAK_EVEN,
     COMPONENT_BREAK_EVEN,
@@ -107,8 +107,52 @@ def fit_joint(
         For a method or a motion model that does not exist.
     """
     check_choice(method, motion)
+    cache = TargetCache(config, outlines=method == "paper")
+    fitted = fit_slices(sections, slices, config, cache, method=method, threads=threads, progress=progress)
+    return fit_along(joint, fitted, motion)
+
+
+@dataclass(frozen=True)
+class SliceFits:
+    """All stations of a joint, each fitted by itself.
+
+    Attributes
+    ----------
+    method : str
+    stations : tuple of StationFit
+    noise : Noise or None
+        What their residuals say of the sensor; None where no estimate was made.
+    seconds, table_seconds : float
+        Wall time, and how much of it went into look-up tables.
+    """
+
+    method: str
+    stations: tuple[StationFit, ...]
+    noise: Noise | None
+    seconds: float
+    table_seconds: float
+
+
+def fit_slices(
+    sections: Sequence[JointSection],
+    slices: Sequence[Slice],
+    config: Config,
+    cache: TargetCache,
+    *,
+    method: str = "grcsm",
+    threads: int | None = None,
+    progress: Callable[[float], None] = lambda share: None,
+) -> SliceFits:
+    """Fit every slice of a joint by itself, with the noise and the shapes that they show together.
+
+    Parameters
+    ----------
+    cache : TargetCache
+        Where look-up tables come from and are kept; joints of one design may share it.
+    """
     begin = time.perf_counter()
-    targets = prepare(sections, slices, TargetCache(config, outlines=method == "paper"))
+    targets = prepare(sections, slices, cache)
+    before = sum(build_seconds(target) for target in distinct(targets))
     fits = _fit_stations(sections, slices, targets, config, method, threads, progress)
     noise = None
     if method == "grcsm":
@@ -117,15 +161,27 @@ def fit_joint(
         if config.shape.freedoms:
             fits, noise = _with_shape(fits, noise, config)
         fits = _with_company(fits, noise)
-        fits, motion = _along_the_joint(fits, motion)
-        fits = [f if f.shape is None else _judged(f, f.shape) for f in fits]
+    built = sum(build_seconds(target) for target in distinct(targets)) - before
+    return SliceFits(method, tuple(fits), noise, time.perf_counter() - begin, built)
+
+
+def fit_along(joint: Joint, fitted: SliceFits, motion: str = "auto") -> JointResult:
+    """The joint as a whole: motion along it, its gap, mesh and volumes (METHOD, sections 5 and 6)."""
+    begin = time.perf_counter()
+    fits, couplings = list(fitted.stations), None
+    if fitted.method == "grcsm" and motion != "independent" and fits:
+        whole = estimate_joint([f.estimate for f in fits if f.estimate], [f.section for f in fits], motion)
+        fits = [dataclasses.replace(f, estimate=e) for f, e in zip(fits, whole.stations, strict=True)]
+        motion, couplings = whole.model, whole.couplings
     else:
         motion = "independent"
+    fits = [f if f.shape is None else _judged(f, f.shape) for f in fits]
     stations = tuple(_station_result(joint, fit) for fit in fits)
-    mesh, volumes = stitch(stations, joint.path.length if joint.path.closed else None)
-    built = sum(build_seconds(target) for target in distinct(targets))
+    correlation = None if couplings is None else area_correlation(stations, couplings)
+    mesh, volumes = stitch(stations, joint.path.length if joint.path.closed else None, correlation)
+    seconds = fitted.seconds + time.perf_counter() - begin
     return JointResult(
-        joint, method, stations, mesh, volumes, motion, noise, time.perf_counter() - begin, built
+        joint, fitted.method, stations, mesh, volumes, motion, fitted.noise, seconds, fitted.table_seconds
     )
 
 
@@ -251,17 +307,6 @@ def _with_company(fits: list[StationFit], noise: Noise) -> list[StationFit]:
     estimates = [fit.estimate for fit in fits if fit.estimate is not None]
     judged = with_company(estimates, [fit.section for fit in fits], noise.correlation)
     return [dataclasses.replace(f, estimate=e) for f, e in zip(fits, judged, strict=True)]
-
-
-def _along_the_joint(fits: list[StationFit], motion: str) -> tuple[list[StationFit], str]:
-    """Replace the stations' estimates by those of the joint as a whole (METHOD, section 5)."""
-    if motion == "independent" or not fits:
-        return fits, "independent"
-    estimates = [fit.estimate for fit in fits if fit.estimate is not None]
-    whole = estimate_joint(estimates, [fit.section for fit in fits], motion)
-    return [
-        dataclasses.replace(f, estimate=e) for f, e in zip(fits, whole.stations, strict=True)
-    ], whole.model
 
 
 def _station_result(joint: Joint, fit: StationFit) -> StationResult:

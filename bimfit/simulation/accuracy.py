@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -29,12 +29,15 @@ class GapEstimate:
         Turn of the line through them, rad, counter-clockwise about ``frame.n``.
     area : float
         m^2.
+    width : float
+        Between the mouth corners, m; NaN where not told.
     """
 
     frame: SectionFrame
     origin: Array
     angle: float
     area: float
+    width: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,10 @@ class GapErrors:
         Rad.
     volume : ndarray
         Of the slice of the gap between midway to either neighbour, m^3.
+    width : ndarray
+        Between the mouth corners, m.
+    length : ndarray
+        How much of the joint each station stands for, m.
     """
 
     s: Array
@@ -58,6 +65,8 @@ class GapErrors:
     z: Array
     angle: Array
     volume: Array
+    width: Array = field(default_factory=lambda: np.zeros(0))
+    length: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def position(self) -> Array:
@@ -126,10 +135,10 @@ def gap_errors(estimates: Iterable[GapEstimate | None], truth: JointTruth) -> Ga
     table = _Truth(truth)
     rows = []
     for estimate in estimates:
-        row = (math.nan,) * 5 if estimate is None else table.error(estimate)
+        row = (math.nan,) * 7 if estimate is None else table.error(estimate)
         if row is not None:
             rows.append(row)
-    columns = np.array(rows, float).reshape(-1, 5).T
+    columns = np.array(rows, float).reshape(-1, 7).T
     return GapErrors(*columns)
 
 
@@ -144,12 +153,13 @@ class _Truth:
         self.origins = np.array([station.gap.origin for station in stations])
         self.angles = np.array([station.gap.angle for station in stations])
         self.areas = np.array([station.gap.area for station in stations])
+        self.mouths = np.array([station.gap.width_mouth for station in stations])
         steps = np.diff(self.s)
         self.widths = np.r_[steps, 0.0] / 2 + np.r_[0.0, steps] / 2 if len(steps) else np.ones(1)
         self.slack = float(np.median(steps)) / 2 if len(steps) else 1e-3
 
-    def error(self, estimate: GapEstimate) -> tuple[float, float, float, float, float] | None:
-        """Of s (where it stands), x, z, angle, volume; None beyond the joint's ends."""
+    def error(self, estimate: GapEstimate) -> tuple[float, ...] | None:
+        """Of s (where it stands), x, z, angle, volume, width and length; None beyond the joint's ends."""
         k = int(np.argmin(np.linalg.norm(self.places - estimate.frame.origin, axis=1)))
         frame = self.frames[k]
         along = float((estimate.frame.origin - frame.origin) @ frame.n)
@@ -161,7 +171,9 @@ class _Truth:
         offset = frame.direction_to_section(estimate.origin - origin)
         angle = _half_turn(sense * estimate.angle - float(np.interp(s, self.s, self.angles)))
         area = estimate.area - float(np.interp(s, self.s, self.areas))
-        return s, float(offset[0]), float(offset[1]), angle, area * float(self.widths[k])
+        width = abs(estimate.width) - float(np.interp(s, self.s, self.mouths))
+        length = float(self.widths[k])
+        return s, float(offset[0]), float(offset[1]), angle, area * length, width, length
 
 
 def _half_turn(angle: float) -> float:
