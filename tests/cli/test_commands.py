@@ -402,3 +402,17 @@ def test_version_and_help(capsys):
     assert capsys.readouterr().out.startswith("bimfit ")
     assert main(["--help"]) == 0
     assert "simulate" in capsys.readouterr().out
+
+
+def test_paper_runs_the_method_as_printed(model, scan, tmp_path, capsys):
+    words = ["fit", str(model), str(scan), "--paper", "-o", str(tmp_path)]
+    assert main([*words, "--no-pictures", "--no-report", "--no-as-built"]) == 0
+    joint = json.loads((tmp_path / "results.json").read_text())["joints"][0]
+    stations = joint["stations"]
+    assert {s["combined"]["stop"] for s in stations} == {"unproven"}
+    for s in stations:  # a grid cell is all there is: nothing is known of its uncertainty
+        assert all(c["covariance"] is None for c in s["components"])
+        assert s["gap"]["sigma"] is None or s["gap"]["sigma"]["x"] is None
+    assert main([*words[:3], "--paper", "--method", "mrcsm", "-o", str(tmp_path / "two")]) == 2
+    assert "give one of them" in capsys.readouterr().err
+    assert not (tmp_path / "two").exists()

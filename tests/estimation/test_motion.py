@@ -340,3 +340,17 @@ def test_many_dense_stations_are_as_good_as_few_and_not_slow_beyond_reason():
     error = (t.value - truth) / np.sqrt(np.diagonal(t.covariance, axis1=1, axis2=2))
     assert np.sqrt(np.mean((t.value - truth) ** 2, axis=0))[0] < SD[0] / 4.0
     assert np.all(np.abs(np.sqrt(np.mean(error**2, axis=0)) - 1.0) < 0.35)
+
+
+def test_couplings_say_how_stations_err_together():
+    """The diagonal is each station's own covariance, and two stations of a constant motion err as one."""
+    rng = np.random.default_rng(17)
+    result = estimate_joint(_stations(rng, _truth("const", rng)), _sections(), "const")
+    poses = [e.components[0].pose for e in result.stations]
+    gradients = rng.normal(size=(N, 3)) * (1.0, 1.0, 0.01)
+    between = result.couplings[0].between(gradients, poses)
+    own = [g @ e.components[0].covariance @ g for g, e in zip(gradients, result.stations, strict=True)]
+    assert np.allclose(np.diag(between), own, rtol=1e-6)
+    alike = result.couplings[0].between(np.tile([1.0, 0.0, 0.0], (N, 1)), poses)
+    assert np.allclose(alike, alike[0, 0], rtol=1e-6)
+    assert estimate_joint(_stations(rng, _truth("const", rng)), _sections(), "independent").couplings is None
