@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from bimfit.errors import ScanError
 from bimfit.scan.boxes import Boxes
 from bimfit.scan.cloud import PointCloud
-from bimfit.scan.formats.las import check_records, las_chunks, las_errors, las_piece, step_note
+from bimfit.scan.formats.las import las_chunks, las_errors, las_piece, step_note
+from bimfit.scan.formats.las_header import check_header
 from bimfit.scan.formats.options import ReadOptions
 
 PIECE = 500_000
@@ -53,7 +54,7 @@ def copc_chunks(path: Path, options: ReadOptions) -> Iterator[PointCloud]:
         ) from error
     wanted = Boxes.of(boxes)
     chosen = DecompressionSelection.base().decompress_z().decompress_intensity().to_lazrs()
-    check_records(path)
+    check_header(path)
     with las_errors(path), path.open("rb") as stream:
         header = LasHeader.read_from(stream)
         if not header.point_count:

@@ -9,7 +9,10 @@ from __future__ import annotations
 import base64
 import binascii
 import json
+import logging
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -93,7 +96,7 @@ def read_tiff(path: Path, options: ReadOptions) -> LineScan:
             "reading TIFF needs the package tifffile", file=path, remedy='pip install "bimfit[tiff]"'
         ) from error
     try:
-        with tifffile.TiffFile(path) as file:
+        with _quiet("tifffile"), tifffile.TiffFile(path) as file:
             page = file.pages.first
             shape, kind = tuple(page.shape), page.dtype
             size = path.stat().st_size
@@ -185,6 +188,17 @@ def read_sick(path: Path, options: ReadOptions) -> LineScan:
         ),
         replace(options, unit=None),
     )
+
+
+@contextmanager
+def _quiet(name: str) -> Iterator[None]:
+    """Keep a logger from saying in several lines what our error says in one."""
+    logger = logging.getLogger(name)
+    before, logger.disabled = logger.disabled, True
+    try:
+        yield
+    finally:
+        logger.disabled = before
 
 
 # -- what they have in common ------------------------------------------------------------------------
