@@ -141,6 +141,16 @@ def test_single_precision_at_map_coordinates_is_pointed_out(tmp_path, cloud):
     assert not any("single precision" in note for note in read_scan(tmp_path / "n.pcd").notes)
 
 
+@pytest.mark.parametrize("count", ["99999999999", "2147483647", "-1", "0"])
+def test_pcd_points_of_no_size_that_can_be(tmp_path, count):
+    head = (
+        f"FIELDS x y z a\nSIZE 4 4 4 8\nTYPE F F F F\nCOUNT 1 1 1 {count}\nWIDTH 3\nHEIGHT 1\nDATA binary\n"
+    )
+    (tmp_path / "p.pcd").write_bytes(head.encode() + bytes(100))
+    with pytest.raises(ScanError, match="does not hold together"):
+        read_scan(tmp_path / "p.pcd")
+
+
 def test_lzf_undoes_what_it_says():
     # literal run, a copy, a long copy that runs into itself
     assert lzf_decompress(bytes([2, 97, 98, 99, 0x20, 2]), 6) == b"abcabc"
@@ -272,6 +282,7 @@ def test_ptx_keeps_scanner_poses_and_missing_returns(tmp_path):
         (lines[:5], "header"),
         (["x", *lines[1:]], "no header"),
         ([*lines[:6], "2 0 0 0", *lines[7:]], "not a rigid motion"),
+        ([*lines[:6], "1e308 0 0 0", *lines[7:]], "not a rigid motion"),
         ([*lines[:20], "1 2 zwei 0.5 1 2 3", *lines[21:]], "line 21, column z"),
     ):
         (tmp_path / "b.ptx").write_text("\n".join(bad) + "\n")

@@ -21,6 +21,8 @@ from bimfit.scan.formats.organised import beams_of
 from bimfit.scan.formats.packed import PIECE, clouds_of, packed_rows
 from bimfit.scan.formats.text import first_lines, read_blocks
 
+_MOST_BYTES = 1 << 20
+"""No point has more."""
 _KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 
 
@@ -172,6 +174,8 @@ def _fill(out: _Header, values: dict[str, list[str]]) -> None:
     kinds = [f"{t.lower()}{int(s)}" for t, s in zip(values["TYPE"], values["SIZE"], strict=True)]
     if not len(names) == len(counts) == len(kinds) or min(counts, default=0) < 1:
         raise ValueError("FIELDS, SIZE, TYPE and COUNT differ in number")
+    if sum(np.dtype(kind).itemsize * count for kind, count in zip(kinds, counts, strict=True)) > _MOST_BYTES:
+        raise ValueError("a point that large")
     out.names, out.counts, out.types = names, counts, [np.dtype(f"<{kind}").str for kind in kinds]
     out.width, out.height = int(values["WIDTH"][0]), int(values.get("HEIGHT", ["1"])[0])
     out.points = int(values["POINTS"][0]) if "POINTS" in values else out.width * out.height

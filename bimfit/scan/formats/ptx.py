@@ -109,6 +109,11 @@ def _header(path: Path, lines: list[str], skip: int) -> tuple[int, int, Array]:
         raise ScanError("the header of the scan does not hold together", file=path, place=place)
     T = matrix.T
     R = T[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > _RIGID or np.linalg.det(R) < 0.0 or not usable(T[None, :3, 3])[0]:
+    if (
+        np.abs(R).max() > 2.0
+        or np.abs(R @ R.T - np.eye(3)).max() > _RIGID
+        or np.linalg.det(R) < 0.0
+        or not usable(T[None, :3, 3])[0]
+    ):
         raise ScanError("the scanner's matrix is not a rigid motion", file=path, place=place)
     return columns, rows, T
