@@ -19,7 +19,7 @@ _SURE = 2.5
 _SAME = 4.0
 _FEW, _LAST = 12, 6
 _ON_CHAIN = 1e-6
-_DROP = (3.9, 1.5, 0.5, -math.inf)
+_DROP = (4.2, 1.0, 0.0, -math.inf)
 """Greatest drop at the mouth with no return inside the gap, with one, two and more."""
 
 

@@ -23,7 +23,7 @@ _LEVEL = 0.025
 _NARROW, _WIDE = 0.4, 1.8
 _BEAMS = 3
 _MOST = 4
-_SURE = 4.0
+_SURE = 4.5
 
 
 def gap_places(section: JointSection, beams: BeamSet, pose: Pose2D) -> list[Pose2D]:
