@@ -23,7 +23,7 @@ class Noise:
     Attributes
     ----------
     sigma : float
-        Standard deviation of a range, m.
+        Standard deviation of a range, m; where it grows with range, what it starts from.
     outlier_share, miss_share : float
         Of beams that meet a component; at least 0.01, for nothing is impossible.
     correlation : float
@@ -60,7 +60,7 @@ def estimate_noise(estimates: Sequence[StationEstimate], sensor: SensorConfig) -
             r = c.residuals
             if c.posterior is None or not c.status.measured or r.n_inliers < 6:
                 continue
-            z = r.residuals
+            z = r.residuals / station.growth
             squares += float(z @ z)
             freedom += len(z) - _PARAMETERS
             products += float(z[1:] @ z[:-1])
@@ -79,6 +79,11 @@ def estimate_noise(estimates: Sequence[StationEstimate], sensor: SensorConfig) -
     out = max(outliers / covered, _FLOOR)
     miss = max(misses / covered, _FLOOR)
     effective = sigma * float(np.sqrt((1.0 + rho) / (1.0 - rho)))
-    return Noise(
-        sigma, out, miss, rho, count, replace(sensor, sigma=effective, outlier_share=out, miss_share=miss)
+    found = replace(
+        sensor,
+        sigma=effective,
+        sigma_per_metre=sensor.sigma_per_metre * effective / sensor.sigma,
+        outlier_share=out,
+        miss_share=miss,
     )
+    return Noise(sigma, out, miss, rho, count, found)

@@ -144,6 +144,8 @@ class StationEstimate:
         Beams that passed between the components.
     virtual : bool
         Whether the beams were made up from a plain point cloud.
+    growth : float
+        How many times the sensor's sigma at no range ``sensor.sigma`` is, because it grows with range.
     """
 
     s: float
@@ -155,3 +157,4 @@ class StationEstimate:
     rival_odds: float = -np.inf
     through: int = 0
     virtual: bool = False
+    growth: float = 1.0

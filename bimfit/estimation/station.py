@@ -40,6 +40,7 @@ from bimfit.geometry.status import Status
 
 _CLIP_MARGIN = 0.025
 _FEW_THROUGH = 3
+_UNKNOWN_RANGE = 1.0
 _WORTH_A_LOOK = -15.0
 
 
@@ -86,6 +87,13 @@ def estimate_station(
     StationEstimate
         Always; what could not be measured has a status that says why and no pose.
     """
+    if sensor.sigma_per_metre > 0.0:
+        distance = typical_range(slice_)
+        fixed = estimate_station(
+            section, slice_, combined, sensor.at(distance), fit,
+            component_matches=component_matches, rivals=rivals,
+        )  # fmt: skip
+        return dataclasses.replace(fixed, growth=sensor.growth(distance))
     finite = np.isfinite(slice_.points).all(axis=1)
     if int(finite.sum()) < fit.min_points:
         reason = f"{int(finite.sum())} returns in the slice, {fit.min_points} are needed"
@@ -109,6 +117,16 @@ def estimate_station(
         reason = "the returns do not determine a pose: its figures are not finite"
         return _nothing(section, slice_, combined, sensor, Status("rejected", reason))
     return best
+
+
+def typical_range(slice_: Slice) -> float:
+    """How far the joint is from the sensor, m: the median range of a slice, or of its points from its eye."""
+    ranges = np.zeros(0)
+    if slice_.beams is not None:
+        ranges = slice_.beams.ranges[np.isfinite(slice_.beams.ranges)]
+    elif slice_.viewpoint is not None and len(slice_.points):
+        ranges = np.hypot(*(slice_.points - slice_.viewpoint).T)
+    return float(np.median(ranges)) if len(ranges) else _UNKNOWN_RANGE
 
 
 def _finite(c: ComponentEstimate) -> bool:
@@ -180,7 +198,7 @@ def reshaped(
     pose = station.combined
     if pose is None or station.components[which].pose is None:
         return [None] * len(profiles)
-    context, _ = _context(section, slice_, pose, sensor, fit)
+    context, _ = _context(section, slice_, pose, sensor.at(typical_range(slice_)), fit)
     beams = context.beams
     scene = _scene(context, (pose, pose))
     side = split_side(scene, beams, np.array([pose.u, pose.v]))

@@ -79,10 +79,10 @@ class TargetCache:
         key = (*(id(profile) for profile in section.components), *_view_cell(viewpoint))
         if key not in self._known:
             edges = matched_edges(section, viewpoint, self.config, outlines=self.outlines)
-            self._known[key] = (section, self._shared(edges))
+            self._known[key] = (section, self._shared(edges, float(np.hypot(*viewpoint))))
         return self._known[key][1]
 
-    def _shared(self, edges: Edges) -> Targets:
+    def _shared(self, edges: Edges, distance: float) -> Targets:
         slack = 0.25 * min(self.config.search.tolerance[:2])
         for other, targets in self._made:
             if all(
@@ -90,7 +90,8 @@ class TargetCache:
                 for p, q in zip(edges, other, strict=True)
             ):
                 return targets
-        made = make_targets(edges, self.config, outlines=self.outlines)
+        config = dataclasses.replace(self.config, sensor=self.config.sensor.at(distance))
+        made = make_targets(edges, config, outlines=self.outlines)
         self._made.append((edges, made))
         return made
 

@@ -149,7 +149,9 @@ def _view(out: Array | None, scenario: Scenario, bearings: Array) -> tuple[Array
 def measured(true_ranges: Array, scenario: Scenario, rng: np.random.Generator) -> Array:
     """What the sensor makes of one sweep's true ranges (n,); NaN where nothing comes back."""
     count = len(true_ranges)
-    ranges = true_ranges + scenario.sigma * correlated_noise(rng, count, scenario.correlation)
+    beyond = np.maximum(np.where(np.isfinite(true_ranges), true_ranges, 0.0) - scenario.sigma_beyond, 0.0)
+    sigma = scenario.sigma + scenario.sigma_per_metre * beyond
+    ranges = true_ranges + sigma * correlated_noise(rng, count, scenario.correlation)
     # Draws are made whether or not they are used, so that one setting does not shift another's numbers.
     lost, strayed, anywhere = rng.random(count), rng.random(count), rng.random(count)
     ranges = np.where(lost < scenario.dropouts, np.nan, ranges)

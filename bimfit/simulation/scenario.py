@@ -49,6 +49,8 @@ class Scenario:
         Between beams, and the half opening, rad.
     sigma : float
         Standard deviation of a range, m.
+    sigma_per_metre, sigma_beyond : float
+        How much sigma grows with each metre of range, from what range on (m).
     correlation : float
         Of the noise of neighbouring beams (lag 1).
     outliers, dropouts : float
@@ -70,6 +72,8 @@ class Scenario:
     bearing_step: float = math.radians(0.352)
     bearing_limit: float = math.radians(30.0)
     sigma: float = 0.003
+    sigma_per_metre: float = 0.0
+    sigma_beyond: float = 0.0
     correlation: float = 0.0
     outliers: float = 0.0
     dropouts: float = 0.0
@@ -89,7 +93,15 @@ class Scenario:
             value = getattr(self, name)
             if not (isinstance(value, tuple) and len(value) == 2 and all(_at_least_zero(x) for x in value)):
                 raise ConfigError(f"{name} takes two numbers of at least 0 (u, v in metres), got {value}")
-        for name in ("common_angle", "own_angle", "bow", "sigma", "min_range"):
+        for name in (
+            "common_angle",
+            "own_angle",
+            "bow",
+            "sigma",
+            "sigma_per_metre",
+            "sigma_beyond",
+            "min_range",
+        ):
             if not _at_least_zero(getattr(self, name)):
                 raise ConfigError(f"{name} must be a number of at least 0, got {getattr(self, name)}")
         for name in (
