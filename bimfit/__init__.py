@@ -23,6 +23,9 @@ _HOMES = {
     "PointCloud": "bimfit.scan.cloud",
     "read_scan": "bimfit.scan.formats",
     "write_scan": "bimfit.scan.formats",
+    "scan_chunks": "bimfit.scan.formats",
+    "ReadOptions": "bimfit.scan.formats.options",
+    "convert": "bimfit.pipeline.convert",
     "load_model": "bimfit.bim.model",
     "model_from_elements": "bimfit.bim.model",
     "find_joints": "bimfit.bim.joints",
@@ -59,6 +62,7 @@ __all__ = [
     "PointCloud",
     "Pose2D",
     "Profile",
+    "ReadOptions",
     "Scenario",
     "SectionFrame",
     "Selection",
@@ -68,6 +72,7 @@ __all__ = [
     "__version__",
     "choose_joints",
     "compare",
+    "convert",
     "cut_joint",
     "find_joints",
     "fit_joint",
@@ -79,6 +84,7 @@ __all__ = [
     "place_cloud",
     "read_results",
     "read_scan",
+    "scan_chunks",
     "simulate",
     "survey",
     "write_issues",
@@ -115,6 +121,7 @@ if TYPE_CHECKING:
     from bimfit.geometry.profile import Profile
     from bimfit.geometry.slice import Slice
     from bimfit.pipeline.compare import compare
+    from bimfit.pipeline.convert import convert
     from bimfit.pipeline.document import read_results
     from bimfit.pipeline.fit import fit_joint
     from bimfit.pipeline.issues import write_issues
@@ -130,5 +137,6 @@ if TYPE_CHECKING:
     from bimfit.registration.result import MatchResult
     from bimfit.registration.table import Target
     from bimfit.scan.cloud import PointCloud
-    from bimfit.scan.formats import read_scan, write_scan
+    from bimfit.scan.formats import read_scan, scan_chunks, write_scan
+    from bimfit.scan.formats.options import ReadOptions
     from bimfit.simulation.scenario import Scenario

@@ -28,7 +28,9 @@ def run(
     where: Placing,
     model: Path = typer.Argument(..., metavar="MODEL.ifc", help="The building model."),
     scan: Path = typer.Argument(
-        ..., metavar="SCAN", help="Line scan (csv, npz) or point cloud (ply, pcd, xyz, ...)."
+        ...,
+        metavar="SCAN",
+        help="Line scan (csv, npz, bag, log, ...) or points (e57, las, ply, pcd, xyz, ...).",
     ),
     output: Path = typer.Option(..., "-o", "--output", metavar="DIR", help="Where the results go."),
     method: str = typer.Option(
