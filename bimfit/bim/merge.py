@@ -84,11 +84,12 @@ def merge(legs: Sequence[Leg]) -> list[Leg]:
 
 
 def _likely(
-    legs: Sequence[Leg], *, parallel: float, turn: tuple[float, float], near: bool = False
+    legs: Sequence[Leg], *, parallel: float, turn: tuple[float, float], near: bool = False, row: bool = False
 ) -> list[tuple[int, int]]:
     """Pairs of straight legs whose axes are parallel and whose u directions have a cosine within ``turn``.
 
-    With ``near``, their sections also lie within reach of one another.
+    With ``near``, their sections also lie within reach of one another; with ``row``, they may be runs of one
+    strip.
     """
     way = np.array([leg.way for leg in legs])
     u = np.array([leg.u[0] for leg in legs])
@@ -103,6 +104,16 @@ def _likely(
         apart = apart - np.einsum("ijk,ik->ij", apart, way)[..., None] * way[:, None]
         reach = 0.5 * (depth[:, None] + depth) + 1.5 * np.maximum(gap[:, None], gap) + 5e-3
         good &= np.linalg.norm(apart, axis=2) <= reach + 0.01 * np.maximum(depth[:, None], depth)
+    if row:
+        middle, side = np.array([leg.middle for leg in legs]), np.array([leg.side for leg in legs])
+        depth, gap = np.array([leg.depth for leg in legs]), np.array([leg.gap for leg in legs])
+        apart, deeper = middle[None] - middle[:, None], np.maximum(depth[:, None], depth)
+        # a little more than what decides, which is measured square to the first one's way
+        loose = 0.02 * np.linalg.norm(apart, axis=2) + 1e-6
+        good &= np.abs(np.einsum("ijk,ik->ij", apart, u)) <= _SNAP + loose
+        good &= np.abs(np.einsum("ijk,ik->ij", apart, side)) <= 0.1 * deeper + loose
+        good &= np.abs(depth[:, None] - depth) <= 0.2 * deeper + 1e-9
+        good &= np.abs(gap[:, None] - gap) <= 2.0 * _SNAP + 1e-9
     return [(int(i), int(j)) for i, j in np.argwhere(np.triu(good, 1))]
 
 
@@ -156,7 +167,7 @@ def _join_collinear(legs: list[Leg]) -> list[Leg]:
     done = False
     while not done:
         done = True
-        for i, j in _likely(legs, parallel=_PARALLEL, turn=(_PARALLEL, 1.1)):
+        for i, j in _likely(legs, parallel=_PARALLEL, turn=(_PARALLEL, 1.1), row=True):
             joined = _collinear(legs[i], legs[j])
             if joined is not None:
                 legs = [leg for k, leg in enumerate(legs) if k not in (i, j)] + [joined]
