@@ -27,8 +27,9 @@ def middle_line(polygons: list[Array], *, max_depth: float) -> tuple[Array, bool
     """
     import shapely
 
-    merged = _union([shapely.Polygon(np.round(p / _LATTICE) * _LATTICE) for p in polygons])
-    merged = merged.simplify(_SIMPLIFY)
+    corners = np.round(np.concatenate(polygons) / _LATTICE) * _LATTICE
+    which = np.repeat(np.arange(len(polygons)), [len(p) for p in polygons])
+    merged = _union(shapely.polygons(shapely.linearrings(corners, indices=which))).simplify(_SIMPLIFY)
     if merged.geom_type == "MultiPolygon":
         merged = max(merged.geoms, key=lambda g: g.area)
     if merged.is_empty or merged.geom_type != "Polygon":
@@ -51,7 +52,7 @@ def middle_line(polygons: list[Array], *, max_depth: float) -> tuple[Array, bool
     return line, bool(holes)
 
 
-def _union(pieces: list[Any]) -> Any:
+def _union(pieces: Any) -> Any:
     """Union of polygons with corners on a lattice that leaves no slits between them."""
     import shapely
 

@@ -108,10 +108,13 @@ def _likely(
         middle, side = np.array([leg.middle for leg in legs]), np.array([leg.side for leg in legs])
         depth, gap = np.array([leg.depth for leg in legs]), np.array([leg.gap for leg in legs])
         apart, deeper = middle[None] - middle[:, None], np.maximum(depth[:, None], depth)
+        half = 0.5 * np.array([np.linalg.norm(leg.points[-1] - leg.points[0]) for leg in legs])
+        hole = np.abs(np.einsum("ijk,ik->ij", apart, way)) - half[:, None] - half
         # a little more than what decides, which is measured square to the first one's way
         loose = 0.02 * np.linalg.norm(apart, axis=2) + 1e-6
         good &= np.abs(np.einsum("ijk,ik->ij", apart, u)) <= _SNAP + loose
         good &= np.abs(np.einsum("ijk,ik->ij", apart, side)) <= 0.1 * deeper + loose
+        good &= (hole >= -0.005 - loose) & (hole <= _HOLE + loose)
         good &= np.abs(depth[:, None] - depth) <= 0.2 * deeper + 1e-9
         good &= np.abs(gap[:, None] - gap) <= 2.0 * _SNAP + 1e-9
     return [(int(i), int(j)) for i, j in np.argwhere(np.triu(good, 1))]
