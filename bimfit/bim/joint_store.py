@@ -122,7 +122,7 @@ def _joint(row: list[Any], points: Any, axes: Any, elements: Sequence[Element]) 
         width=width,
         length=length,
         depth=depth,
-        path=JointPath(points, axes[:, 0], axes[:, 1], closed),
+        path=JointPath.restored(points, axes[:, 0], axes[:, 1], closed=closed),
         two_sided=two,
         state=state,
         filler=None if filler is None else elements[filler].guid,

@@ -60,6 +60,13 @@ class JointPath:
             raise ValueError("u x v must point along the path")
 
     @classmethod
+    def restored(cls, points: Array, u: Array, v: Array, *, closed: bool) -> JointPath:
+        """A path from the arrays of another, which were checked when that was made."""
+        path = object.__new__(cls)
+        path.__dict__.update(points=points, u=u, v=v, closed=closed)
+        return path
+
+    @classmethod
     def straight(cls, start: ArrayLike, end: ArrayLike, u: ArrayLike) -> JointPath:
         """A single leg from its ends (3,) and a rough u direction (3,); v completes n = u x v."""
         a, b = np.asarray(start, float), np.asarray(end, float)
