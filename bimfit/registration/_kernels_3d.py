@@ -459,14 +459,23 @@ def bound_node(points, rho, weights, pivot, pose, half, V, tables, R, J, slope):
 
 
 @jit
-def climb(field, points, weights, pivot, x0, V, steps, reach, at, first):
+def penalty(prior, pose):
+    """What a Gaussian prior adds to the score of a pose (6,): -1/2 sum of prior (6,) times its squares."""
+    total = 0.0
+    for k in range(6):
+        total -= 0.5 * prior[k] * pose[k] * pose[k]
+    return total
+
+
+@jit
+def climb(field, points, weights, pivot, x0, V, steps, reach, prior, at, first):
     """Climb on the lattice from ``at`` (d,) by steps of ``first`` down to 1; returns score, evaluations."""
     R = np.empty((3, 3))
     J = np.empty((3, 3))
     pose = np.empty(6)
     d = at.shape[0]
     pose_of(x0, V, steps, at, pose)
-    best = score_at(field, points, weights, pivot, pose, R, J)
+    best = score_at(field, points, weights, pivot, pose, R, J) + penalty(prior, pose)
     count = 1
     jump = first
     while jump >= 1:
@@ -481,7 +490,7 @@ def climb(field, points, weights, pivot, x0, V, steps, reach, at, first):
                         continue
                     at[j] = new
                     pose_of(x0, V, steps, at, pose)
-                    score = score_at(field, points, weights, pivot, pose, R, J)
+                    score = score_at(field, points, weights, pivot, pose, R, J) + penalty(prior, pose)
                     count += 1
                     if score > best:
                         best = score
@@ -553,7 +562,7 @@ def search(problem, tables, nodes, state, best_at, motion, settings, zones, zone
 
     Parameters
     ----------
-    problem : field, points, rho, weights, pivot, x0, V, steps, reach
+    problem : field, points, rho, weights, pivot, x0, V, steps, reach, prior
     nodes : keys, low, high, heap, free
     state : float64: 0 best score, 1 heap size, 2 nodes made, 3 free nodes, 4 evaluations,
         5 greatest bound set aside, 6 known zones, 7 score of a new mode
@@ -563,7 +572,7 @@ def search(problem, tables, nodes, state, best_at, motion, settings, zones, zone
     -------
     int : 0 done, 1 evaluations used up, 2 no room, 3 a new mode was found (in ``best_at`` row 1)
     """
-    field, points, rho, weights, pivot, x0, V, steps, reach = problem
+    field, points, rho, weights, pivot, x0, V, steps, reach, prior = problem
     keys, low, high, heap, free = nodes
     eps, delta, allowed, phase = settings
     d = steps.shape[0]
@@ -603,7 +612,7 @@ def search(problem, tables, nodes, state, best_at, motion, settings, zones, zone
         pose_of(x0, V, steps, at, pose)
         state[4] += 1.0
         if single:
-            score = score_at(field, points, weights, pivot, pose, R, J)
+            score = score_at(field, points, weights, pivot, pose, R, J) + penalty(prior, pose)
             if phase == 0.0 and score > state[0]:
                 state[0] = score
                 best_at[0, :] = at
@@ -613,8 +622,12 @@ def search(problem, tables, nodes, state, best_at, motion, settings, zones, zone
                 verdict = 3
                 break
             continue
-        constant = bound_node(points, rho, weights, pivot, pose, half, V, tables, R, J, slope)
-        whole = constant
+        whole = bound_node(points, rho, weights, pivot, pose, half, V, tables, R, J, slope)
+        # a concave prior lies under its tangent at the middle
+        whole += penalty(prior, pose)
+        for j in range(d):
+            for k in range(6):
+                slope[j] -= prior[k] * pose[k] * V[k, j]
         for j in range(d):
             whole += abs(slope[j]) * half[j]
         ceiling = min(top, whole)
@@ -634,10 +647,10 @@ def search(problem, tables, nodes, state, best_at, motion, settings, zones, zone
                 at[j] = math.floor(at[j])
             if phase == 0.0:
                 pose_of(x0, V, steps, at, pose)
-                score = score_at(field, points, weights, pivot, pose, R, J)
+                score = score_at(field, points, weights, pivot, pose, R, J) + penalty(prior, pose)
                 state[4] += 1.0
                 if score > state[0]:
-                    state[0], count = climb(field, points, weights, pivot, x0, V, steps, reach, at, 4)
+                    state[0], count = climb(field, points, weights, pivot, x0, V, steps, reach, prior, at, 4)
                     state[4] += count
                     best_at[0, :] = at
         axis = 0

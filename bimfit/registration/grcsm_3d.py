@@ -22,10 +22,17 @@ from bimfit.errors import ConfigError
 from bimfit.geometry.pose import Array, rigid_inverse, transform_points
 from bimfit.geometry.status import OK, Status
 from bimfit.registration import _kernels_3d as kernels
-from bimfit.registration.problem_3d import Problem3D, flat_directions, make_problem, scales, without
+from bimfit.registration.problem_3d import (
+    Problem3D,
+    flat_directions,
+    make_problem,
+    motion_of,
+    scales,
+    without,
+)
 from bimfit.registration.result import MatchResult, Mode
 from bimfit.registration.rigid_3d import Refined, Refiner, direction_name, parameters_of
-from bimfit.registration.search_3d import Outcome3D, Search3D, incumbent
+from bimfit.registration.search_3d import Outcome3D, Search3D, first_incumbent
 from bimfit.registration.table_3d import Target3D
 
 _LEAST_SHARE = 0.1
@@ -49,6 +56,9 @@ def match_3d(
     time_budget: float | None = None,
     weights: ArrayLike | None = None,
     pivot: ArrayLike | None = None,
+    prior_sigma: Sequence[float] | None = None,
+    prior_weight: float = 1.0,
+    incumbent: ArrayLike | None = None,
     refine: bool = True,
 ) -> MatchResult:
     """Find the model's motion that explains most of a cloud, and prove it.
@@ -73,8 +83,17 @@ def match_3d(
         At least 0; default 1.
     pivot : array_like, shape (3,), optional
         What rotations turn about, in the cloud's frame; default the middle of the cloud.
+    prior_sigma : sequence of 6 float, optional
+        Standard deviations (m, rad) of a Gaussian prior on the motion within the window, axis by axis; its
+        log, times ``prior_weight``, is added to the score. ``inf`` leaves an axis free.
+    prior_weight : float
+        Points' worth of one unit of log-prior.
+    incumbent : array_like, shape (4, 4) or (6,), optional
+        A motion to start from, such as that of the scan before. It never changes what is proven, only how
+        soon; outside the window the nearest one within is taken.
     refine : bool
-        Fit continuously to the surface from the best lattice pose on.
+        Fit continuously to the surface from the best lattice pose on; not done where there is a prior on the
+        pose, which that fit knows nothing of.
 
     Returns
     -------
@@ -89,7 +108,17 @@ def match_3d(
         For points or settings that cannot be used.
     """
     begun = time.perf_counter()
-    problem = make_problem(target, points, prior, window, tolerance, weights=weights, pivot=pivot)
+    problem = make_problem(
+        target,
+        points,
+        prior,
+        window,
+        tolerance,
+        weights=weights,
+        pivot=pivot,
+        prior_sigma=prior_sigma,
+        prior_weight=prior_weight,
+    )
     limit = np.inf if max_evaluations is None else float(max_evaluations)
     deadline = None if time_budget is None else begun + time_budget
     if not (eps >= 0.0 and 0.0 <= delta < 1.0):
@@ -97,21 +126,22 @@ def match_3d(
     if not len(problem.points):
         status = Status("no_data", "there are no points to match")
         return MatchResult("grcsm-3d", np.full(6, np.nan), status=status)
-    conditional, at, score, spent, flat = _prepare(problem, eps, limit, deadline)
+    start = None if incumbent is None else problem.nearest(motion_of(incumbent, "incumbent"))
+    conditional, at, score, spent, flat = _prepare(problem, eps, limit, deadline, start)
     outcome = Search3D(conditional, at, score, spent).run(eps, delta, limit, deadline)
     pose = _polished(problem, conditional, outcome)
     seconds = time.perf_counter() - begun
-    return _result(problem, conditional, outcome, pose, flat, refine, seconds)
+    return _result(problem, conditional, outcome, pose, flat, refine and prior_sigma is None, seconds)
 
 
 def _prepare(
-    problem: Problem3D, eps: float, limit: float, deadline: float | None
+    problem: Problem3D, eps: float, limit: float, deadline: float | None, start: Array | None
 ) -> tuple[Problem3D, Array, float, int, Flat]:
     """An incumbent, and the search without what the data leave open there.
 
     A poor incumbent says nothing of what the data fix, so that the search itself betters it first.
     """
-    at, score, spent = incumbent(problem, limit)
+    at, score, spent = first_incumbent(problem, limit, start)
     if score < _GOOD_SHARE * problem.total and len(at):
         first = Search3D(problem, at, score, spent).run(eps, 0.0, min(limit, spent + _SCOUTING), deadline)
         at, score, spent = first.at, first.score, first.evaluations
@@ -138,8 +168,8 @@ def _polished(problem: Problem3D, conditional: Problem3D, outcome: Outcome3D) ->
         return pose
     around = replace(problem, x0=pose)
     at = np.zeros(len(problem.steps))
-    field, points, _, weights, pivot, x0, V, steps, _ = around.packed
-    score, _ = kernels.climb(field, points, weights, pivot, x0, V, steps, np.full(len(at), 8.0), at, 4)
+    field, points, _, weights, pivot, x0, V, steps, _, prior = around.packed
+    score, _ = kernels.climb(field, points, weights, pivot, x0, V, steps, np.full(len(at), 8.0), prior, at, 4)
     return around.pose(at) if score > outcome.score + problem.worth(_NO_LOSS) else pose
 
 

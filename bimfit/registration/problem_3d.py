@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from bimfit.errors import ConfigError, ScanError
 from bimfit.geometry.pose import Array, rigid_inverse, transform_points
 from bimfit.registration import _kernels_3d as kernels
-from bimfit.registration.rigid_3d import WEAK_POINTS, about, direction_name, matrix_of
+from bimfit.registration.rigid_3d import WEAK_POINTS, about, direction_name, matrix_of, parameters_of
 from bimfit.registration.table_3d import Target3D
 
 
@@ -36,6 +36,8 @@ class Problem3D:
         Directions that are searched; pose = x0 + V (steps * coordinates).
     steps, reach : ndarray, shape (d,)
         Length of a lattice step, and how many steps the window reaches each way.
+    precision : ndarray, shape (6,)
+        Of the prior on the pose, points' worth a squared cell or radian; 0 where it is free.
     """
 
     target: Target3D
@@ -47,6 +49,7 @@ class Problem3D:
     V: Array
     steps: Array
     reach: Array
+    precision: Array
 
     @property
     def rho(self) -> Array:
@@ -80,6 +83,7 @@ class Problem3D:
             self.V,
             self.steps,
             self.reach,
+            self.precision,
         )
 
     def pose(self, at: ArrayLike) -> Array:
@@ -90,19 +94,20 @@ class Problem3D:
         """Score of a pose (6,) as ``pose`` gives it."""
         J, R = np.empty((3, 3)), np.empty((3, 3))
         args = (self.target.field, self.points, self.weights, self.pivot, np.ascontiguousarray(pose), R, J)
-        return float(kernels.score_at(*args))
+        return float(kernels.score_at(*args)) + float(kernels.penalty(self.precision, args[4]))
 
     def bound(self, low: ArrayLike, high: ArrayLike) -> float:
         """Upper bound of the score over the lattice poses ``low`` .. ``high`` (d,)."""
         a, b = np.asarray(low, float), np.asarray(high, float)
         half = 0.5 * (b - a) * self.steps
+        middle = self.pose(0.5 * (a + b))
         slope = np.empty(len(half))
         constant = kernels.bound_node(
             self.points,
             self.rho,
             self.weights,
             self.pivot,
-            self.pose(0.5 * (a + b)),
+            middle,
             half,
             self.V,
             self.target.tables.packed,
@@ -110,7 +115,17 @@ class Problem3D:
             np.empty((3, 3)),
             slope,
         )
+        slope -= self.V.T @ (self.precision * middle)
+        constant += kernels.penalty(self.precision, middle)
         return float(min(constant + np.abs(slope) @ half, self.total))
+
+    def nearest(self, motion: Array) -> Array:
+        """The lattice coordinates (d,) of the window that lie nearest to a motion of the model (4, 4)."""
+        pivot = self.target.origin + self.pivot * self.target.spacing
+        T = rigid_inverse(motion) @ self.prior
+        shift = (transform_points(T, pivot) - pivot) / self.target.spacing
+        pose = np.concatenate([shift, parameters_of(T)[3:]]) - self.x0
+        return np.asarray(np.clip(np.rint(self.V.T @ pose / self.steps), -self.reach, self.reach))
 
     def T_model_scan(self, pose: Array) -> Array:
         """What carries the scan to the designed model at a pose (6,), shape (4, 4)."""
@@ -128,6 +143,8 @@ def make_problem(
     *,
     weights: ArrayLike | None = None,
     pivot: ArrayLike | None = None,
+    prior_sigma: Sequence[float] | None = None,
+    prior_weight: float = 1.0,
 ) -> Problem3D:
     """Check a search's input and bring it to lattice cells; arguments as those of :func:`match_3d`.
 
@@ -148,7 +165,10 @@ def make_problem(
     w = np.ones(len(cloud)) if weights is None else np.asarray(weights, float)
     if w.shape != (len(cloud),) or not np.all(np.isfinite(w)) or np.any(w < 0.0):
         raise ConfigError("weights must be one number of at least 0 a point")
-    motion = _motion(prior)
+    spread = np.full(6, np.inf) if prior_sigma is None else np.asarray(prior_sigma, float)
+    if spread.shape != (6,) or not np.all(spread > 0.0) or not 0.0 <= prior_weight < np.inf:
+        raise ConfigError("prior_sigma takes six positive numbers, and prior_weight is at least 0")
+    motion = motion_of(prior)
     back = rigid_inverse(motion)
     local = transform_points(back, cloud)
     centre = np.zeros(3) if not len(cloud) else 0.5 * (local.min(axis=0) + local.max(axis=0))
@@ -170,18 +190,26 @@ def make_problem(
         np.ascontiguousarray(np.eye(6)[:, searched]),
         (step / scale)[searched],
         np.ceil(half / step - 1e-9)[searched],
+        prior_weight * (scale / spread) ** 2,
     )
 
 
-def _motion(prior: ArrayLike | None) -> Array:
+def motion_of(prior: ArrayLike | None, name: str = "prior") -> Array:
+    """A rigid 4 x 4 matrix of itself or of six numbers; the identity of None.
+
+    Raises
+    ------
+    ConfigError
+        When it is neither, or not rigid.
+    """
     if prior is None:
         return np.eye(4)
     given = np.asarray(prior, float)
     if given.shape not in ((6,), (4, 4)) or not np.all(np.isfinite(given)):
-        raise ConfigError("prior must be a 4 x 4 matrix or six numbers: x, y, z and rotation vector")
+        raise ConfigError(f"{name} must be a 4 x 4 matrix or six numbers: x, y, z and rotation vector")
     motion = matrix_of(given) if given.shape == (6,) else given
     if not np.allclose(motion[:3, :3] @ motion[:3, :3].T, np.eye(3), atol=1e-6):
-        raise ConfigError("prior must be a rigid motion")
+        raise ConfigError(f"{name} must be a rigid motion")
     return motion
 
 

@@ -30,8 +30,8 @@ class Outcome3D:
     rivals: tuple[tuple[float, Array], ...] = ()
 
 
-def incumbent(problem: Problem3D, limit: float) -> tuple[Array, float, int]:
-    """Climb from the window's middle and from a few points spread over it: (at, score, evaluations)."""
+def first_incumbent(problem: Problem3D, limit: float, start: Array | None = None) -> tuple[Array, float, int]:
+    """Climb from a start (d,), the window's middle and a few points over it: (at, score, evaluations)."""
     from scipy.stats import qmc
 
     d = len(problem.steps)
@@ -41,14 +41,16 @@ def incumbent(problem: Problem3D, limit: float) -> tuple[Array, float, int]:
     if np.prod(2.0 * problem.reach + 1.0) > 1000.0:
         spread = 2.0 * qmc.Halton(d, scramble=False).random(_STARTS + 1)[1:] - 1.0
         starts = np.concatenate([starts, np.rint(0.6 * spread * problem.reach)])
+    if start is not None:
+        starts = np.concatenate([start[None], starts])
     first = max(1, 2 ** int(np.log2(max(problem.reach.max() / 3.0, 1.0))))
-    best, score, spent = starts[0], -1.0, 0
-    field, points, _, weights, pivot, x0, V, steps, reach = problem.packed
-    for start in starts:
+    best, score, spent = starts[0], -np.inf, 0
+    field, points, _, weights, pivot, x0, V, steps, reach, prior = problem.packed
+    for begin in starts:
         if spent >= limit:
             break
-        at = start.copy()
-        found, count = kernels.climb(field, points, weights, pivot, x0, V, steps, reach, at, first)
+        at = begin.copy()
+        found, count = kernels.climb(field, points, weights, pivot, x0, V, steps, reach, prior, at, first)
         spent += int(count)
         if found > score:
             best, score = at, float(found)
@@ -132,9 +134,9 @@ class Search3D:
 
     def _take_rival(self, rivals: list[tuple[float, Array]]) -> None:
         """Climb from a leaf that lies apart; keep its summit unless it is one that is known."""
-        field, points, _, weights, pivot, x0, V, steps, reach = self.problem.packed
+        field, points, _, weights, pivot, x0, V, steps, reach, prior = self.problem.packed
         leaf, summit = self.best[1].copy(), self.best[1].copy()
-        score, count = kernels.climb(field, points, weights, pivot, x0, V, steps, reach, summit, 4)
+        score, count = kernels.climb(field, points, weights, pivot, x0, V, steps, reach, prior, summit, 4)
         self.state[4] += count
         k = int(self.state[6])
         known = np.any(np.all(np.abs(self.zones[:k] - summit) <= self.zone_half, axis=1))

@@ -69,13 +69,19 @@ def error(T, truth) -> tuple[float, float]:
     size=st.integers(0, 6),
     angle=st.integers(0, 6),
     weighted=st.booleans(),
+    prior=st.booleans(),
 )
-def test_no_pose_of_a_box_beats_its_bound(target, seed: int, size: int, angle: int, weighted: bool) -> None:
+def test_no_pose_of_a_box_beats_its_bound(
+    target, seed: int, size: int, angle: int, weighted: bool, prior: bool
+) -> None:
     """At every level, on the lattice and between, for points on the surface and beside it."""
     rng = np.random.default_rng(seed)
     points = np.concatenate([cloud(seed, 40, motion(rng, 0.02, 0.1)), rng.uniform(-0.05, 0.2, (10, 3))])
     weights = rng.uniform(0.0, 2.0, len(points)) if weighted else None
-    problem = make_problem(target, points, None, (0.1,) * 3 + (0.3,) * 3, STEP, weights=weights)
+    spread = (*rng.uniform(0.005, 0.1, 3), *rng.uniform(0.02, 0.5, 2), np.inf) if prior else None
+    problem = make_problem(
+        target, points, None, (0.1,) * 3 + (0.3,) * 3, STEP, weights=weights, prior_sigma=spread
+    )
     low = rng.integers(-60, 30, 6).astype(float)
     high = low + np.concatenate([rng.integers(0, 2**size + 1, 3), rng.integers(0, 2**angle + 1, 3)])
     bound = problem.bound(low, high)
@@ -310,3 +316,61 @@ def test_bench_gives_a_row_a_method() -> None:
     assert rows[0].proven == 1
     assert rows[0].mean_mm < 5.0
     assert all(row.starts == 1 and row.median_ms > 0.0 for row in rows)
+
+
+@pytest.mark.parametrize(
+    "window",
+    [(0.006, 0.0, 0.006, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.01, 0.01), (0.005, 0.0, 0.0, 0.0, 0.0, 0.03)],
+)
+def test_a_prior_is_added_exactly(target, window) -> None:
+    """The score is the surface's, less half a point for each squared sigma; proven against brute force."""
+    points = cloud(20, 120, about([0.08, 0.045, 0.05], [0.003, 0.0, -0.002], [0.0, 0.006, 0.01]))
+    spread = np.array([0.002, 0.002, 0.003, 0.01, 0.004, np.inf])
+    plain = make_problem(target, points, None, window, STEP)
+    lattice = list(itertools.product(*(np.arange(-r, r + 1) for r in plain.reach)))
+    poses = np.array([plain.pose(at) for at in lattice])
+    metres = poses * np.array([target.spacing] * 3 + [1.0] * 3)
+    expected = np.array([plain.score(pose) for pose in poses]) - 0.5 * 12.0 * ((metres / spread) ** 2).sum(
+        axis=1
+    )
+    result = match_3d(target, points, None, window, STEP, eps=0.0, prior_sigma=spread, prior_weight=12.0)
+    assert result.stop == "proven"
+    assert result.score == pytest.approx(expected.max(), abs=1e-9)
+    best = poses[int(np.argmax(expected))]
+    np.testing.assert_allclose(T_model_scan(result), plain.T_model_scan(best), atol=1e-9)
+
+
+def test_a_prior_holds_what_the_data_leave_open() -> None:
+    rng = np.random.default_rng(21)
+    plate = Target3D.of(
+        box([-0.16, -0.16, -0.02], [0.16, 0.16, 0.0]), 0.008, viewpoint=(0, 0, 1), spacing=0.004
+    )
+    points = np.column_stack([rng.uniform(-0.08, 0.08, (200, 2)), rng.normal(0.005, 0.0005, 200)])
+    window, spread = (0.01, 0.01, 0.01, 0.0, 0.0, 0.02), (0.001, 0.001, np.inf, np.inf, np.inf, 0.002)
+    open_ = match_3d(plate, points, None, window, STEP)
+    assert {name for name, _ in open_.flat} == {"shift along x", "shift along y", "turn about z"}
+    for _, vector in open_.flat:
+        assert np.linalg.norm(vector) == pytest.approx(1.0)
+    held = match_3d(plate, points, None, window, STEP, prior_sigma=spread, prior_weight=50.0)
+    assert held.status.name == "ok"
+    assert not held.flat
+    np.testing.assert_allclose(held.parameters[[0, 1, 5]], 0.0, atol=1e-6)
+    assert held.parameters[2] == pytest.approx(0.005, abs=0.001)
+
+
+def test_a_warm_start_proves_the_same_sooner(target) -> None:
+    truth = motion(np.random.default_rng(22), 0.02, 0.03)
+    points = cloud(22, 300, truth)
+    cold = match_3d(target, points, eps=0.02, refine=False)
+    warm = match_3d(target, points, eps=0.02, incumbent=T_scan_model(cold), refine=False)
+    assert warm.score >= cold.score - 1e-9
+    assert warm.gap <= 0.02 * warm.score + 1e-9
+    again = match_3d(target, points, eps=0.02, incumbent=cold.parameters, max_evaluations=60, refine=False)
+    assert again.score >= cold.score - 1e-9
+    outside = match_3d(target, points, eps=0.02, incumbent=matrix_of([9.0, 0, 0, 0, 0, 0]), refine=False)
+    assert outside.score == pytest.approx(cold.score, rel=0.02)
+    for bad in (2.0 * np.eye(4), np.zeros(5)):
+        with pytest.raises(ConfigError, match="incumbent"):
+            match_3d(target, points, incumbent=bad)
+    with pytest.raises(ConfigError, match="prior_sigma"):
+        match_3d(target, points, prior_sigma=(0.0,) * 6)
