@@ -24,8 +24,8 @@ PIECE = 500_000
 _SIGNATURE = slice(377, 381)
 _ENTRY = np.dtype([("level", "<i4"), ("key", "<i4", 3), ("offset", "<u8"), ("size", "<i4"), ("count", "<i4")])
 _DEEPEST = 30
-_MOST_POINTS = 50_000_000
-"""No node holds more: writers keep to some 100,000."""
+_MOST_POINTS = 1000
+"""No byte of a node holds more points; a fraction of one is usual."""
 
 
 def looks_like_copc(head: bytes) -> bool:
@@ -103,7 +103,8 @@ def _nodes(path: Path, stream: BinaryIO, header: Any, wanted: Boxes) -> NDArray[
         found.append(entries[entries["count"] > 0])
     nodes = np.concatenate(found)
     nodes = nodes[np.argsort(nodes["offset"], kind="stable")]
-    if (nodes["count"] > _MOST_POINTS).any() or int(nodes["count"].sum()) > header.point_count:
+    crowded = nodes["count"].astype(np.int64) > _MOST_POINTS * nodes["size"].astype(np.int64)
+    if crowded.any() or int(nodes["count"].sum(dtype=np.int64)) > header.point_count:
         raise ScanError("damaged: its octree holds more points than the file", file=path)
     return nodes
 
