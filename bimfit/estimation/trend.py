@@ -20,6 +20,8 @@ NODES = 150
 _NU = 4.0
 _JUMP = np.array([0.004, 0.004, 0.035])
 """What a station that jumps is off by, standard deviations in u, v (m) and theta (rad)."""
+_LEAST = 0.25
+"""Cells shared by stations never make a variance less than this share of what it is without."""
 _JUMPS = 0.01
 """Share of stations that jump."""
 
@@ -258,11 +260,16 @@ def with_shared_cells(sites: Sites, basis: Basis, trend: Trend) -> Trend:
     pull = sites.precision[k, :, 0] * trend.weight[k, None]
     R = np.einsum("ik,ia->kai", basis.functions[k], pull).reshape(-1, len(k))
     G = trend.spread @ R[basis.moves.ravel()]
-    shared = (G * s) @ rho @ (G * s).T
-    values, axes = np.linalg.eigh(shared)
-    shared = (axes * np.maximum(values, 0.0)) @ axes.T
-    extra = _blocks(shared, basis)
-    return replace(trend, covariance=trend.covariance + extra, spread=trend.spread + shared)
+    # corners seen at different places between two beams err in opposite ways: the sum may well be less
+    variances, root = np.linalg.eigh(trend.spread)
+    kept = variances > 1e-13 * variances[-1]
+    root = root[:, kept] * np.sqrt(variances[kept])
+    back = root.T / variances[kept, None]
+    half = back @ (G * s)
+    values, axes = np.linalg.eigh(half @ rho @ half.T)
+    wide = root @ axes
+    shared = (wide * np.maximum(values, _LEAST - 1.0)) @ wide.T
+    return replace(trend, covariance=trend.covariance + _blocks(shared, basis), spread=trend.spread + shared)
 
 
 class Evidence:
