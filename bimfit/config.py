@@ -102,7 +102,7 @@ class SearchConfig:
         The paper's L; None derives it per axis from Eq. 1 and 2. 2 gives MRCSM, in
         which the tests an axis and level follow from L.
     bound : {"majorant", "overlap", "block"}
-        Affine majorants, block maxima with one overlap (both proven), or the paper's
+        Quadratic majorants, block maxima with one overlap (both proven), or the paper's
         block maxima as printed (Eq. 3 to 5), which is not an upper bound.
     eps : float
         Stop once the open bound is within ``eps`` times the best score.

@@ -19,7 +19,7 @@ from bimfit.geometry.visibility import clip_edges, visible_edges
 from bimfit.registration.table import Tables, Target
 from bimfit.simulation.rangefinder import aim
 
-COMBINED_BREAK_EVEN, COMPONENT_BREAK_EVEN = 80, 800
+COMBINED_BREAK_EVEN, COMPONENT_BREAK_EVEN = 80, 300
 """Slices from which on majorant tables pay for themselves, in the wide and in a component's small window."""
 _MARGIN = 0.1
 """How much farther than the components' profiles a scan is used, since they may have moved, m."""
@@ -178,7 +178,7 @@ def prepare(sections: Sequence[JointSection], slices: Sequence[Slice], cache: Ta
 def economic(search: SearchConfig, stations: int, break_even: int) -> SearchConfig:
     """The same search by the bound that is cheaper in all, tables included.
 
-    Affine majorants search several times faster than overlapped block maxima but take far longer to build.
+    Quadratic majorants search several times faster than overlapped block maxima but take far longer to build.
     Both are proven and find the same pose.
     """
     if search.bound == "majorant" and stations < break_even:
