@@ -176,19 +176,34 @@ def bench_exactness(target: Target, slices: Sequence[Slice], config: SearchConfi
     )  # fmt: skip
 
 
-def bench_threads(target: Target, slices: Sequence[Slice], config: SearchConfig, threads: int = 2) -> float:
-    """How many times faster threads go through the slices than one thread does (``match_many``)."""
+@dataclass(frozen=True)
+class Threading:
+    """How many times faster threads were than one, and how many processors the machine let them have."""
+
+    ratio: float
+    processors: float
+
+
+def bench_threads(
+    target: Target, slices: Sequence[Slice], config: SearchConfig, threads: int = 2
+) -> Threading:
+    """How many times faster threads go through the slices than one thread does (``match_many``).
+
+    Where the processors given are fewer than the threads, the machine is busy and the ratio says little.
+    """
     priors = [Pose2D()] * len(slices)
     match_many(target, slices, priors, config, threads=threads)
 
-    def run(workers: int) -> float:
-        started = time.perf_counter()
+    def run(workers: int) -> tuple[float, float]:
+        started, used = time.perf_counter(), time.process_time()
         match_many(target, slices, priors, config, threads=workers)
-        return time.perf_counter() - started
+        wall = time.perf_counter() - started
+        return wall, (time.process_time() - used) / wall
 
     # in turns, so that both meet the same load
     pairs = [(run(1), run(threads)) for _ in range(5)]
-    return min(a for a, _ in pairs) / min(b for _, b in pairs)
+    wall, processors = min(b for _, b in pairs)
+    return Threading(min(a for a, _ in pairs)[0] / wall, processors)
 
 
 def table_figures(target: Target) -> list[dict[str, object]]:
