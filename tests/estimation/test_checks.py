@@ -182,3 +182,12 @@ def test_longest_run():
     assert longest_run(np.array([False, True, True, False, True])) == 2
     assert longest_run(np.zeros(3, bool)) == 0
     assert longest_run(np.ones(4, bool)) == 4
+
+
+def test_a_component_that_a_dozen_returns_support_is_weak_and_says_so():
+    sec = S.butt()
+    slice_ = S.scan(np.random.default_rng(4), sec.components, step=8.0 * S.STEP, half=10, sigma=0.001)
+    result = estimate_station(sec, slice_, Pose2D(), SensorConfig(sigma=0.001), FIT)
+    assert all(6 <= c.n_inliers <= 12 for c in result.components)
+    assert all(c.status.name == "weak" and "too few" in c.status.reason for c in result.components)
+    assert result.status.name == "weak"
