@@ -101,7 +101,13 @@ def _likely(
         middle = np.array([leg.middle for leg in legs])
         depth, gap = np.array([leg.depth for leg in legs]), np.abs([leg.gap for leg in legs])
         apart = middle[None] - middle[:, None]
-        apart = apart - np.einsum("ijk,ik->ij", apart, way)[..., None] * way[:, None]
+        along = np.einsum("ijk,ik->ij", apart, way)
+        half = 0.5 * np.array([np.linalg.norm(leg.points[-1] - leg.points[0]) for leg in legs])
+        length = np.array([leg.length for leg in legs])
+        # a little more than what decides, which is measured along the first one's way
+        common = half[:, None] + half - np.abs(along) * 0.999 + 1e-6
+        good &= common >= 0.99 * _COMMON * np.minimum(length[:, None], length)
+        apart = apart - along[..., None] * way[:, None]
         reach = 0.5 * (depth[:, None] + depth) + 1.5 * np.maximum(gap[:, None], gap) + 5e-3
         good &= np.linalg.norm(apart, axis=2) <= reach + 0.01 * np.maximum(depth[:, None], depth)
     if row:
