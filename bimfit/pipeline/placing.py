@@ -282,7 +282,11 @@ def _nothing_near(
     return ScanError(
         reason,
         file=path,
-        remedy="check its units and its frame; --scan-pose places a scan that is in scanner coordinates",
+        remedy=(
+            f"leave out --scan-crs {placing.crs}, or check its units and its frame"
+            if placing.crs != "auto"
+            else "check its units and its frame; --scan-pose places a scan that is in scanner coordinates"
+        ),
     )
 
 
