@@ -63,8 +63,10 @@ def borrow(
     out = {}
     for i, (station, section) in enumerate(zip(stations, sections, strict=True)):
         own = [c.status.measured and c.pose is not None for c in station.components]
-        if station.status.measured or all(own) or any(c.empty for c in section.components):
+        if station.status.measured or any(c.empty for c in section.components):
             continue
+        if all(own):  # refused as a whole: what its components say does not count either
+            own = [False, False]
         left, right = s[:i][agreeing[:i]], s[i + 1 :][agreeing[i + 1 :]]
         before = float(s[i] - left[-1]) / spacing if len(left) else math.inf
         after = float(right[0] - s[i]) / spacing if len(right) else math.inf
