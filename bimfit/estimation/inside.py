@@ -29,6 +29,7 @@ def returns_inside(
     poses: tuple[Pose2D, Pose2D],
     spread: tuple[float, float],
     sigma: float,
+    sweeps: int = 1,
 ) -> int:
     """How many returns come from between the two sides of the gap on beams that nothing should stop there.
 
@@ -39,6 +40,8 @@ def returns_inside(
         when both components are moved towards each other by 2.5 of these and half a beam.
     sigma : float
         Of a range, m.
+    sweeps : int
+        How many sweeps share the slice.
     """
     a, b = (
         pose.apply(side) for pose, side in zip(poses, (section.gap.side_a, section.gap.side_b), strict=True)
@@ -55,18 +58,27 @@ def returns_inside(
     chosen = beams.take(inside)
     across = b[0] - a[0]
     across = across / max(float(np.hypot(*across)), 1e-9)
-    reach = float(np.median(chosen.r))
+    step = beam_step(beams, float(np.median(chosen.r)), sweeps)
     least = np.full(len(chosen), np.inf)
     for pose, sd, component, sign in zip(poses, spread, section.components, (1.0, -1.0), strict=True):
-        closer = sign * (_SURE * sd + 0.5 * beams.spacing * reach) * across
+        closer = sign * (_SURE * sd + 0.5 * step) * across
         for shift in (np.zeros(2), closer):
             there = Pose2D(pose.u + float(shift[0]), pose.v + float(shift[1]), pose.theta)
             least = np.minimum(least, predict_ranges(edge_rows(component, there), chosen)[0])
     loose = least > chosen.r + _SAME * sigma
     for side, sd in zip((a, b), spread, strict=True):
         # what lies on a side itself, deep in the gap where a beam grazes it, is the component
-        loose &= distance_to_chain(chosen.points, side) > _SURE * sd + beams.spacing * reach
+        loose &= distance_to_chain(chosen.points, side) > _SURE * sd + step
     return int(loose.sum())
+
+
+def beam_step(beams: BeamSet, reach: float, sweeps: int) -> float:
+    """How far apart the beams of one sweep are at a distance ``reach``, m, however many sweeps interleave."""
+    ends = np.repeat(beams.eye[:, :2], np.diff(beams.start), axis=0) + reach * beams.d.T
+    middle = beams.d.mean(axis=1)
+    aside = ends @ np.array([-middle[1], middle[0]]) / max(float(np.hypot(*middle)), 1e-9)
+    alone = float(np.ptp(aside)) / max(len(beams) / max(sweeps, 1) - 1.0, 1.0)
+    return max(beams.spacing * reach, alone) if sweeps > 1 else beams.spacing * reach
 
 
 def within(points: Array, ring: Array) -> Mask:
@@ -131,7 +143,7 @@ def with_inside(
     if a is None or b is None or not station.status.measured:
         return station
     drop = drop_at_mouth(section, station, sigma)
-    count = returns_inside(section, beams, (a, b), place_sd(section, station), sigma)
+    count = returns_inside(section, beams, (a, b), place_sd(section, station), sigma, sweeps)
     inside = math.ceil(count / max(sweeps, 1))
     most = _DROP[min(inside, len(_DROP) - 1)]
     if drop <= most:
