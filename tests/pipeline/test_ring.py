@@ -28,7 +28,7 @@ TABS = (55, 115, 178, 237, 298, 356)
 """Where the insert's tabs are, and half of what they take, degrees."""
 TAB = 13
 INSERT, RING = 8.50, 9.90
-"""Radii of the edges as designed: a gap of 1.40 mm, which is not what was built. All lengths here are mm."""
+"""Radii of the edges below their chamfers, as designed: 1.40 mm apart, which is not what was built. In mm."""
 LAND = 0.45
 """The insert is flat beside the gap for so long; then comes a groove."""
 INSERT_TOP, RING_TOP, DEEP = 35.76, 36.22, 33.0
@@ -91,7 +91,13 @@ def result(file, edges):
     path = JointPath(
         np.add(spine, (*edges.centre, top)) * MM, u, np.tile([0.0, 0.0, 1.0], (SECTIONS, 1)), closed=True
     )
-    insert = [(INSERT - 1.0, DEEP), (INSERT, DEEP), (INSERT, INSERT_TOP), (INSERT - 1.0, INSERT_TOP)]
+    insert = [
+        (INSERT - 1.0, DEEP),
+        (INSERT, DEEP),
+        (INSERT, INSERT_TOP - 0.2),
+        (INSERT - 0.1, INSERT_TOP),
+        (INSERT - 1.0, INSERT_TOP),
+    ]
     ring = [
         (RING, DEEP),
         (RING + 1.5, DEEP),
@@ -101,7 +107,8 @@ def result(file, edges):
     ]
     components = (Profile.polygon(section_of(insert)), Profile.polygon(section_of(ring)))
     gap = GapOutline(
-        section_of([(INSERT, INSERT_TOP), (INSERT, DEEP)]), section_of([(RING, RING_TOP - 0.2), (RING, DEEP)])
+        section_of([(INSERT, INSERT_TOP - 0.2), (INSERT, DEEP)]),
+        section_of([(RING, RING_TOP - 0.2), (RING, DEEP)]),
     )
     stations = path.stops[:-1]
     frames = [path.rough_frame(float(s)) for s in stations]
