@@ -1030,16 +1030,16 @@ def _rival(values: Array, points: Array, count: int, total: float, h: float, inf
     for k in range(count):
         mass[min(int((points[k, 3] - lo) / h), cells - 1)] += values[k] / total
     top = int(np.argmax(mass))
-    left, right = top, top
-    while left > 0 and mass[left - 1] > 0.1 * mass[top]:
-        left -= 1
-    while right < cells - 1 and mass[right + 1] > 0.1 * mass[top]:
-        right += 1
     rival, centre = 0.0, 0.0
-    for c in range(cells):
-        if (c < left or c > right) and abs(c - top) * h > 0.003:
-            rival += mass[c]
-            centre += mass[c] * (c - top) * h
+    for side in (-1, 1):
+        valley, c = mass[top], top + side
+        while 0 <= c < cells:
+            valley = min(valley, mass[c])
+            # a valley for those beyond it: a spike at the end of a plain makes no rival of the plain
+            if valley < 0.1 * mass[c] and abs(c - top) * h > 0.003:
+                rival += mass[c]
+                centre += mass[c] * (c - top) * h
+            c += side
     info[6] = rival
     info[7] = centre / rival if rival > 0.0 else 0.0
 
