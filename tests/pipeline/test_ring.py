@@ -94,8 +94,8 @@ def result(file, edges):
     insert = [
         (INSERT - 1.0, DEEP),
         (INSERT, DEEP),
-        (INSERT, INSERT_TOP - 0.2),
-        (INSERT - 0.1, INSERT_TOP),
+        (INSERT, INSERT_TOP - 0.15),
+        (INSERT - 0.08, INSERT_TOP),
         (INSERT - 1.0, INSERT_TOP),
     ]
     ring = [
@@ -107,7 +107,7 @@ def result(file, edges):
     ]
     components = (Profile.polygon(section_of(insert)), Profile.polygon(section_of(ring)))
     gap = GapOutline(
-        section_of([(INSERT, INSERT_TOP - 0.2), (INSERT, DEEP)]),
+        section_of([(INSERT, INSERT_TOP - 0.15), (INSERT, DEEP)]),
         section_of([(RING, RING_TOP - 0.2), (RING, DEEP)]),
     )
     stations = path.stops[:-1]
