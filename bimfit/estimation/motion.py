@@ -261,7 +261,7 @@ def _apply(
                 components.append(c)
                 continue
             corner = section.gap.mouth[which]
-            pose, covariance = _mixed(parts[which], t, i, corner, c)
+            pose, covariance = _mixed(t, i, corner, c)
             if t.distance[i] > FLAG:
                 outliers.append((i, "AB"[which]))
                 off = float(np.hypot(*(parts[which].value[i] - t.value[i])[:2])) * 1e3
@@ -275,7 +275,7 @@ def _apply(
     return tuple(out), tuple(outliers)
 
 
-def _mixed(sites: Sites, t: Trend, i: int, corner: Array, c: ComponentEstimate) -> tuple[Pose2D, Array]:
+def _mixed(t: Trend, i: int, corner: Array, c: ComponentEstimate) -> tuple[Pose2D, Array]:
     """Pose and covariance of a station that follows the model or, maybe, has jumped.
 
     A jump is no part of any model of the motion: where one is likely, what was measured well stands. Where
@@ -284,9 +284,10 @@ def _mixed(sites: Sites, t: Trend, i: int, corner: Array, c: ComponentEstimate) 
     x, V = t.value[i], t.covariance[i]
     w = float(t.jump[i]) if c.status.name == "ok" else 0.0
     if w > 1e-3:
-        own, apart = sites.value[i], sites.value[i] - x
-        # a station may say nothing about one direction
-        spread = np.linalg.inv(sites.precision[i] + np.diag([400.0, 400.0, 4.0]))
+        # with its prior, for the ranges alone may say nothing about one direction
+        assert c.pose is not None and c.covariance is not None
+        own, at = _motion_of(c.pose, corner), at_corner(c.pose, corner)
+        apart, spread = own - x, at @ c.covariance @ at.T
         x = x + w * apart
         V = (1.0 - w) * V + w * spread + w * (1.0 - w) * np.outer(apart, apart)
         if w > 1.0 - 1e-3:
