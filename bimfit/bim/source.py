@@ -145,7 +145,7 @@ def _unzip(data: bytes, file: Path) -> bytes:
     except ModelError:
         raise
     except Exception as error:  # zlib, lzma and zipfile raise errors of many kinds
-        raise ModelError(f"is a damaged archive: {error}", file=file) from error
+        raise ModelError(f"is a damaged archive: {_printable(str(error))}", file=file) from error
     if len(content) > limit:
         raise ModelError("unpacks to far more than an IFC file would; refused", file=file)
     return content
