@@ -25,6 +25,8 @@ _BETWEEN, _BEYOND = 3.0, 1.0
 """How many spacings from measured neighbours a station may be: between two of them, and past the last."""
 _SURE = 0.002
 _AGREES = 0.005
+_SHAKES = 0.015
+"""A component this far from where the joint has it was not carried there by a sensor that shakes, m."""
 
 
 def at_corner(pose: Pose2D, corner: Array) -> Array:
@@ -119,6 +121,9 @@ def _made(
     elif has is not None:
         c = station.components[has]
         assert c.pose is not None and c.covariance is not None
+        off = c.pose.apply(corners[has]) - model[has].apply(corners[has])
+        if float(np.hypot(*off)) > _SHAKES:
+            return None
         J = at_corner(c.pose, corners[has])
         poses[has], spreads[has] = c.pose, np.asarray(J @ c.covariance @ J.T)
         # the middle of the gap goes with the component that is known, and by half with the other

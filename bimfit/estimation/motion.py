@@ -93,7 +93,8 @@ def estimate_joint(
     estimates, sections : sequence
         One a station, in the order of the joint.
     model : {"independent", "const", "rigid", "linear", "smooth", "kinked", "auto"}
-        ``rigid``: u and v linear, theta constant. ``auto`` chooses by BIC.
+        ``rigid``: u and v linear, theta constant. ``auto`` chooses by BIC, and ``independent`` where less
+        than half of the measured stations are ``ok``.
 
     Returns
     -------
@@ -113,6 +114,8 @@ def estimate_joint(
     stations = tuple(estimates)
     parts = (_sites(stations, sections, 0), _sites(stations, sections, 1))
     if model == "independent" or min(int(p.known.sum()) for p in parts) < _FEW:
+        return JointEstimate(stations, "independent")
+    if model == "auto" and not _mostly_sound(stations):
         return JointEstimate(stations, "independent")
     fits: dict[str, tuple[Trend, Trend]] = {}
     bases: dict[str, tuple[Basis, Basis]] = {}
@@ -141,6 +144,16 @@ def estimate_joint(
     )
     bent = knots if chosen == "kinked" else np.zeros(0)
     return JointEstimate(out, chosen, criterion, bent, outliers, (couplings[0], couplings[1]))
+
+
+def _mostly_sound(stations: Sequence[StationEstimate]) -> bool:
+    """Whether at least half of the stations that are measured are ``ok``.
+
+    Where ranges leave a direction free at most stations, as in a lap that no beam looks into, they are no
+    Gaussian sites: a model built on them wanders off and does not know it.
+    """
+    measured = [e for e in stations if e.status.measured]
+    return 2 * sum(e.status.name == "ok" for e in measured) >= len(measured)
 
 
 def _fit_pair(parts: tuple[Sites, Sites], bases: tuple[Basis, Basis]) -> tuple[Trend, Trend]:
