@@ -25,7 +25,7 @@ _BETWEEN, _BEYOND = 3.0, 1.0
 """How many spacings from measured neighbours a station may be: between two of them, and past the last."""
 _SURE = 0.002
 _AGREES = 0.005
-_SHAKES = 0.015
+SHAKES = 0.015
 """A component this far from where the joint has it was not carried there by a sensor that shakes, m."""
 
 
@@ -122,7 +122,7 @@ def _made(
         c = station.components[has]
         assert c.pose is not None and c.covariance is not None
         off = c.pose.apply(corners[has]) - model[has].apply(corners[has])
-        if float(np.hypot(*off)) > _SHAKES:
+        if float(np.hypot(*off)) > SHAKES:
             return None
         J = at_corner(c.pose, corners[has])
         poses[has], spreads[has] = c.pose, np.asarray(J @ c.covariance @ J.T)

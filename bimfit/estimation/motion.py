@@ -12,7 +12,7 @@ import numpy as np
 from bimfit.errors import ConfigError
 from bimfit.estimation import _kernels_knots as kernels
 from bimfit.estimation import trend
-from bimfit.estimation.borrow import FLAG, at_corner, borrow
+from bimfit.estimation.borrow import FLAG, SHAKES, at_corner, borrow
 from bimfit.estimation.result import ComponentEstimate, StationEstimate
 from bimfit.estimation.trend import Basis, Sites, Trend
 from bimfit.geometry.joint_section import JointSection
@@ -279,6 +279,9 @@ def _apply(
                 outliers.append((i, "AB"[which]))
                 off = float(np.hypot(*(parts[which].value[i] - t.value[i])[:2])) * 1e3
                 reason = f"its own returns put it {off:.1f} mm away from what its neighbours say"
+                if status.name == "weak" and off > 1e3 * SHAKES:
+                    # a place that no gap bears out and no neighbour either is none
+                    status = Status("rejected", f"component {'AB'[which]}: {reason}, and {status.reason}")
                 if status.name == "ok":
                     status = Status("ambiguous", f"component {'AB'[which]}: {reason}")
                 if c.status.name == "ok":

@@ -107,6 +107,34 @@ def test_a_jump_is_flagged_and_does_not_pull_its_neighbours():
     assert error[40] > 2e-3  # what was measured well stands, even where no neighbour has it
 
 
+def test_a_far_place_that_no_gap_bears_out_is_refused():
+    """A station may land anywhere along a flat face: far from the joint, with no gap in sight, it is none."""
+    rng = np.random.default_rng(5)
+    truth = _truth("linear", rng)
+    truth[0, 40, 0] += 40e-3
+    stations = _stations(rng, truth)
+    unseen = Status("weak", "no beam passes between the components")
+    stations[40] = dataclasses.replace(stations[40], status=unseen)
+    near = dataclasses.replace(stations[20], status=unseen)
+    stations[20] = near
+    result = estimate_joint(stations, _sections(), "auto")
+    assert result.stations[40].status.name == "rejected"
+    assert (
+        "neighbours" in result.stations[40].status.reason and "no beam" in result.stations[40].status.reason
+    )
+    assert result.stations[20].status == unseen
+
+
+def test_where_most_stations_are_weak_each_stays_as_it_is():
+    rng = np.random.default_rng(6)
+    stations = [
+        dataclasses.replace(e, status=Status("weak", "no beam passes")) if i % 3 else e
+        for i, e in enumerate(_stations(rng, _truth("linear", rng)))
+    ]
+    assert estimate_joint(stations, _sections(), "auto").model == "independent"
+    assert estimate_joint(stations, _sections(), "linear").model == "linear"
+
+
 def test_a_station_off_by_what_chance_explains_is_flagged_but_follows_the_joint():
     rng = np.random.default_rng(5)
     truth = _truth("linear", rng)
