@@ -41,6 +41,7 @@ from bimfit.geometry.status import Status
 _CLIP_MARGIN = 0.025
 _FEW_THROUGH = 3
 _UNKNOWN_RANGE = 1.0
+_FAR_ALONG = 0.025
 _WORTH_A_LOOK = -15.0
 
 
@@ -229,7 +230,10 @@ def _placed(
     reason: str,
 ) -> tuple[StationEstimate, Cost]:
     """The best estimate near the combined pose and its rivals, and what covering a beam costs."""
-    slid, cost = _place(context, combined, rivals)
+    slid, cost = max(
+        (_place(context, combined, rivals), *(_place(context, pose, ()) for pose in _home(combined))),
+        key=lambda placed: float(placed[0].scores.max()),
+    )
     best = _components(context, slice_, slid, cost, matches, reason)
     if slid.rival is None or slid.rival_odds < _WORTH_A_LOOK:
         return best, cost
@@ -290,6 +294,19 @@ def _place(context: _Context, combined: Pose2D, rivals: Sequence[Pose2D]) -> tup
     beams, used = (context.beams, cost) if usable.all() else (context.beams.take(usable), cost.take(usable))
     slid = best_start(context.section, beams, used, (combined, *rivals), context.sensor, context.fit)
     return slid, cost
+
+
+def _home(combined: Pose2D) -> tuple[Pose2D, ...]:
+    """The combined pose slid back along the faces to the design, where it is too far for the slide to look.
+
+    Faces that go on for longer than the scan is used leave the hits of a combined search all but flat along
+    them; only the beams that miss tell where the gap is.
+    """
+    c, s = math.cos(combined.theta), math.sin(combined.theta)
+    along = combined.u * c + combined.v * s
+    if abs(along) < _FAR_ALONG:
+        return ()
+    return (Pose2D(combined.u - along * c, combined.v - along * s, combined.theta),)
 
 
 def _window(context: _Context) -> Window:

@@ -152,3 +152,15 @@ def test_a_coarse_fan_is_uncertain_by_its_cell_and_not_ambiguous():
             widest = max(widest, sd)
     assert widest > 0.5 * cell / np.sqrt(12)
     assert names.count("ok") >= 11
+
+
+@pytest.mark.parametrize("astray", [-0.1, 0.08])
+def test_a_search_that_went_astray_along_long_faces_is_brought_home(astray):
+    """Faces longer than the scan is wide leave hits flat along them: the gap's missing beams must tell."""
+    sec, rng = S.butt(width=0.6), np.random.default_rng(3)
+    a, b = Pose2D(0.004, 0.002, 0.01), Pose2D(-0.003, 0.001, -0.02)
+    slice_ = S.scan(rng, [sec.components[0].moved(a), sec.components[1].moved(b)])
+    result = estimate_station(sec, slice_, Pose2D(astray, 0.0015, 0.0), SensorConfig(), FitConfig())
+    assert result.status.name == "ok", result.status
+    for c, truth, corner in zip(result.components, (a, b), sec.gap.mouth, strict=True):
+        assert np.hypot(*(c.pose.apply(corner) - truth.apply(corner))) < 0.002
