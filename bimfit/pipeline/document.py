@@ -128,7 +128,10 @@ class JointDocument:
     @property
     def contact(self) -> str:
         """The closest that the two components come as built, see :func:`closest`."""
-        return closest((one.contact, one.narrowest, one.sigma_narrowest) for one in self.trusted)
+        return closest(
+            (one.contact, one.narrowest, one.sigma_narrowest if one.status == "ok" else math.inf)
+            for one in self.trusted
+        )
 
     @property
     def storey(self) -> str:

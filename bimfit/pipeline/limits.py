@@ -131,7 +131,10 @@ class Verdict:
 
 
 def judge(joint: JointDocument, limits: Limits | None) -> Verdict:
-    """Hold a joint against its limits: a station out of any of them fails it."""
+    """Hold a joint against its limits: any station out of them fails it, a weak one if that is sure.
+
+    A joint of weak stations alone was not measured well enough to pass.
+    """
     trusted = joint.trusted
     if not trusted:
         return Verdict("not measured", joint.reason or _commonest(joint.stations))
@@ -141,6 +144,8 @@ def judge(joint: JointDocument, limits: Limits | None) -> Verdict:
     breaches = tuple(sorted((b for b in found if b is not None), key=lambda b: -b.excess))
     if breaches:
         return Verdict("fail", "; ".join(breach.words(limits) for breach in breaches), breaches)
+    if not any(station.status == "ok" for station in trusted):
+        return Verdict("not measured", _commonest(joint.stations))
     share = len(trusted) / len(joint.stations)
     if share < LEAST_MEASURED:
         why = _commonest([station for station in joint.stations if not station.trusted])
@@ -176,10 +181,11 @@ def _value(name: str, station: StationDocument) -> tuple[float, float]:
 def _breach(name: str, pair: Range, stations: tuple[StationDocument, ...]) -> Breach | None:
     value, sigma = values(name, stations)
     excess = np.fmax(pair[0] - value, value - pair[1])
-    out = excess > 0.0
+    weak = np.array([station.status != "ok" for station in stations])
+    out = excess > np.where(weak, SURE * sigma, 0.0)
     if not out.any():
         return None
-    worst = int(np.nanargmax(excess))
+    worst = int(np.nanargmax(np.where(out, excess, np.nan)))
     return Breach(
         name, float(value[worst]), float(sigma[worst]), float(excess[worst]), stations[worst], int(out.sum())
     )

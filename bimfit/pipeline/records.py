@@ -92,10 +92,14 @@ class StationResult:
 
     @property
     def nearness(self) -> tuple[str, float, float]:
-        """Contact, narrowest width and its deviation, m; an empty contact where there is no gap."""
+        """Contact, narrowest width and its deviation, m; an empty contact where there is no gap.
+
+        The deviation is without bound where the station is not ``ok``: nothing is beyond doubt there.
+        """
         if self.gap is None:
             return "", float("nan"), float("nan")
         sigma = float("nan") if self.gap.sigma is None else self.gap.sigma.width_narrowest
+        sigma = sigma if self.status.name == "ok" else float("inf")
         return self.gap.contact, self.gap.width_narrowest, sigma
 
     @property
