@@ -12,7 +12,7 @@ from bimfit.geometry.status import Status
 
 _SURE = 4.0
 """Standard deviations from which on pooled residuals are no accident."""
-_MATTERS = 0.2
+_MATTERS = 0.06
 """A shape matters where it departs from the design by this share of sigma, however sure it is."""
 _NEIGHBOURS, _MOSTLY = 6, 0.6
 
@@ -31,7 +31,7 @@ def with_company(
     """
     departures = [departure(stations, sections, which, correlation=correlation) for which in (0, 1)]
     least = _MATTERS * min((e.sensor.sigma for e in stations), default=0.0)
-    reasons = [_reason(d) if abs(d.worst) > least else "" for d in departures]
+    reasons = [_reason(d) if d.rms > least else "" for d in departures]
     rejected = [e.status.name == "rejected" for e in stations]
     out = []
     for i, station in enumerate(stations):
