@@ -38,7 +38,6 @@ from bimfit.geometry.profile import Profile
 from bimfit.geometry.slice import Slice
 from bimfit.geometry.status import Status
 
-_CLIP_MARGIN = 0.025
 _FEW_THROUGH = 3
 _UNKNOWN_RANGE = 1.0
 _FAR_ALONG = 0.025
@@ -282,7 +281,9 @@ def _usable(context: _Context, scene: Scene, side: Ints, pose: Pose2D) -> Mask:
     if surface[0].all() and surface[1].all():
         return np.ones(len(context.beams), bool)
     edges = (pose.apply(components[0].edges), pose.apply(components[1].edges))
-    return ~beside_artificial_ends(scene, side, context.beams, edges, surface, _CLIP_MARGIN)
+    return ~beside_artificial_ends(
+        scene, side, context.beams, edges, surface, 2.0 * context.fit.placement_tolerance
+    )
 
 
 def _place(context: _Context, combined: Pose2D, rivals: Sequence[Pose2D]) -> tuple[SlideResult, Cost]:

@@ -21,7 +21,7 @@ from bimfit.geometry.slice import Slice
 from bimfit.geometry.status import Status
 from bimfit.pipeline.fit import fit_station
 from bimfit.pipeline.mouth import mouth_paths, spine_stations
-from bimfit.pipeline.targets import TargetCache, Targets, match_reach, with_assumed_view
+from bimfit.pipeline.targets import TargetCache, Targets, match_reach, profile_reach, with_assumed_view
 from bimfit.scan.coverage import sweep_positions
 from bimfit.scan.grid import StationGrid
 from bimfit.scan.slicing import cut_slices
@@ -121,7 +121,8 @@ class LiveFit:
 
     def section(self, s: float) -> JointSection | None:
         """The design at a place along the joint, m; None where no cross-section shows both components."""
-        return next(iter(design_sections(self.model, self.joint, [s])), None)
+        reach = profile_reach(self.config)
+        return next(iter(design_sections(self.model, self.joint, [s], reach)), None)
 
     def place(self, sweep: LineScan) -> float:
         """Where along the joint a sweep in model coordinates crosses it, m; NaN where it does not."""

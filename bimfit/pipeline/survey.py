@@ -24,7 +24,7 @@ from bimfit.pipeline.placing import NEAR, Placed, Placing, joint_boxes, place_sc
 from bimfit.pipeline.profile_file import TaughtProfile
 from bimfit.pipeline.records import JointResult, SurveyResult
 from bimfit.pipeline.shown import share_shown
-from bimfit.pipeline.targets import match_reach, with_assumed_view, with_recovered_view
+from bimfit.pipeline.targets import match_reach, profile_reach, with_assumed_view, with_recovered_view
 from bimfit.scan.cloud import PointCloud
 from bimfit.scan.coverage import covers, scan_stations
 from bimfit.scan.nearby import Nearby
@@ -225,7 +225,7 @@ def cut_joint(
     mouth = mouth_paths(joint)[0]
     along = scan_stations(scan, mouth, config.slices.spacing)
     stations = spine_stations(joint.path, mouth, along)
-    sections = design_sections(elements, joint, stations) if len(stations) else ()
+    sections = design_sections(elements, joint, stations, profile_reach(config)) if len(stations) else ()
     if not sections:
         return joint, (), ()
     slices = cut_slices(

@@ -101,14 +101,14 @@ def matched_edges(
 ) -> Edges:
     """What of each component is matched: its visible surface, or its whole outline as in the paper.
 
-    Only what lies within reach of the mouth: tables grow with the surface, and the sides of a deep gap say
-    nothing more.
+    Only what the returns can reach within the window: tables grow with the surface. Less would tie the hits
+    to where the surface was cut off, and along a face that goes on they say nothing.
     """
     if outlines:
         edges: Edges = tuple(profile.edges[profile.surface] for profile in section.components)
     else:
         edges = visible_edges(section.components, viewpoint)
-    box = np.full(2, match_reach(config))
+    box = np.full(2, match_reach(config) + max(config.search.window[:2]))
     return tuple(clip_edges(part, -box, box) for part in edges)
 
 
@@ -121,6 +121,11 @@ def matched_slice(slice_: Slice, config: Config) -> Slice:
 def match_reach(config: Config) -> float:
     """How far from the mouth surface and returns are matched, m."""
     return config.fit.reach + _MARGIN
+
+
+def profile_reach(config: Config) -> float:
+    """How far from the gap the components are cut, m: a cut end comes near no return that is matched."""
+    return match_reach(config) + max(config.search.window[:2]) + 2.0 * config.fit.placement_tolerance
 
 
 def make_targets(edges: Edges, config: Config, *, outlines: bool = False) -> Targets:

@@ -1,0 +1,40 @@
+"""Walls that go on for longer than the scan is used: their cut ends must not hold the fit."""
+
+import numpy as np
+import pytest
+from worlds import boards, corner_errors, fans
+
+from bimfit.config import Config
+from bimfit.geometry.pose import Pose2D
+from bimfit.pipeline.fit import fit_joint
+from bimfit.pipeline.survey import cut_joint
+from bimfit.pipeline.targets import match_reach
+
+POSES = (Pose2D(0.004, 0.003, 0.012), Pose2D(0.006, 0.001, 0.015))
+
+
+@pytest.fixture(scope="module")
+def walls():
+    """A joint of 10 mm between long walls, seen aslant: returns lie denser on one side."""
+    model, joint, profiles = boards(0.010, 0.1, (3.0, 2.0), 0.5)
+    scan = fans(
+        profiles, POSES, np.linspace(0.01, 0.49, 12), (0.17, 0.36), np.radians(np.arange(-40, 40.1, 0.25)),
+        0.003, np.random.default_rng(5),
+    )  # fmt: skip
+    return cut_joint(model, joint, scan, Config())
+
+
+def test_a_cut_end_is_out_of_reach_of_every_return(walls):
+    _, sections, slices = walls
+    for section, cut in zip(sections, slices, strict=True):
+        farthest = np.abs(cut.points[(np.abs(cut.points) <= match_reach(Config())).all(axis=1)]).max()
+        for profile in section.components:
+            ends = profile.edges[~profile.surface]
+            assert len(ends) and np.abs(ends).max(axis=(1, 2)).min() > farthest + 0.12
+
+
+def test_walls_seen_aslant_are_measured(walls):
+    result = fit_joint(*walls, Config(), threads=1)
+    assert sum(station.status.name == "ok" for station in result.stations) >= 10
+    errors = corner_errors(result, POSES, ((-0.005, 0.0), (0.005, 0.0)))
+    assert np.nanmax(errors) < 0.002
