@@ -45,6 +45,8 @@ class SensorConfig:
     sigma_per_metre, sigma_beyond : float
         How much sigma grows with each metre of range, from what range on (m): sigma + sigma_per_metre
         max(range - sigma_beyond, 0). Of a sensor good to 30 mm, and 3 % beyond 1 m: 0.03, 0.03 and 1.
+    correlation : float
+        Of the noise of neighbouring beams (lag 1).
     outlier_share, miss_share : float
         Share of beams that return from something else, and of beams that meet the
         component but return nothing.
@@ -60,6 +62,7 @@ class SensorConfig:
     sigma: float = 0.003
     sigma_per_metre: float = 0.0
     sigma_beyond: float = 0.0
+    correlation: float = 0.0
     outlier_share: float = 0.01
     miss_share: float = 0.01
     max_range: float = 5.6
@@ -72,11 +75,25 @@ class SensorConfig:
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise ConfigError(f"{name} must be a number of at least 0, got {value}")
-        _share(self, "outlier_share", "miss_share")
+        _share(self, "outlier_share", "miss_share", "correlation")
 
     def growth(self, distance: float) -> float:
         """How many times sigma a range of that length, m, deviates."""
         return 1.0 + self.sigma_per_metre * max(distance - self.sigma_beyond, 0.0) / self.sigma
+
+    @property
+    def independent_share(self) -> float:
+        """Independent beams that each is worth among many neighbours: (1 - rho) / (1 + rho)."""
+        return (1.0 - self.correlation) / (1.0 + self.correlation)
+
+    def pooled(self) -> SensorConfig:
+        """The sensor whose beams are independent and together worth the same: sigma / sqrt(f)."""
+        if self.correlation == 0.0:
+            return self
+        more = 1.0 / math.sqrt(self.independent_share)
+        return dataclasses.replace(
+            self, sigma=more * self.sigma, sigma_per_metre=more * self.sigma_per_metre, correlation=0.0
+        )
 
     def at(self, distance: float) -> SensorConfig:
         """The sensor at one range, m: sigma is what it is there, and grows no more."""

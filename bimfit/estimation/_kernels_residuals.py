@@ -69,6 +69,7 @@ def residuals(
     eye: Array,
     spacing: float,
     sigma: float,
+    spread: Array,
     out: Array,
     z: Array,
     places: Array,
@@ -84,6 +85,8 @@ def residuals(
         Its covariance about the pivot, for grazing returns.
     rho, face, other : (n,)
         Range to the component and the edge met, and the range to the other component, which may hide it.
+    spread : (n,)
+        What each range deviates by, m; residuals are brought to ``sigma``.
     used : (n,)
         Beams that speak for it; cleared where the other hides it.
     out : (FIGURES,) out
@@ -113,19 +116,20 @@ def residuals(
             x, y = eye[q, 0] + d[0, k] * rho[k], eye[q, 1] + d[1, k] * rho[k]
             nx = cos * edges[e, 4] - sin * edges[e, 5]
             ny = sin * edges[e, 4] + cos * edges[e, 5]
+            own = spread[k]
             sd, c = range_sd(nx, ny, d[0, k], d[1, k], x - pivot[0], y - pivot[1], cov)
             misfit = r[k] - rho[k]
-            if excused(r[k], rho[k], sd, c, sigma):
+            if excused(r[k], rho[k], sd, c, own):
                 quiet_all += 1
-                quiet += int(abs(misfit) < 4.0 * sigma)
+                quiet += int(abs(misfit) < 4.0 * own)
                 continue
-            inlier = r[k] > 0.0 and abs(misfit) < 4.0 * sigma
+            inlier = r[k] > 0.0 and abs(misfit) < 4.0 * own
             stray[covered], missed[covered] = r[k] > 0.0 and not inlier, not r[k] > 0.0
             strays += int(stray[covered])
             misses += int(missed[covered])
             covered += 1
             if inlier:
-                z[count], faces[count] = misfit, e
+                z[count], faces[count] = misfit * (sigma / own), e
                 places[count, 0] = eye[q, 0] + d[0, k] * r[k]
                 places[count, 1] = eye[q, 1] + d[1, k] * r[k]
                 count += 1

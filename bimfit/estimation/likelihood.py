@@ -8,7 +8,7 @@ not returns nothing or, with density e_o / r_max, an outlier. Only the differenc
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -78,6 +78,9 @@ class BeamSet:
         First beam of every group of one origin; its origin and look direction.
     order : ndarray, shape (n,)
         Index of every beam in what it was made from.
+    spread, scale : ndarray, shape (n,), or None
+        How many times the sensor's sigma each range deviates, and as how many times it counts in the
+        likelihood, see :mod:`bimfit.estimation.spread`; None where all deviate alike.
     """
 
     rays: Array
@@ -85,6 +88,8 @@ class BeamSet:
     start: Ints
     eye: Array
     order: Ints
+    spread: Array | None = None
+    scale: Array | None = None
 
     @classmethod
     def of(cls, beams: Beams) -> BeamSet:
@@ -121,13 +126,15 @@ class BeamSet:
             before[self.start],
             self.eye,
             self.order[keep],
+            None if self.spread is None else self.spread[keep],
+            None if self.scale is None else self.scale[keep],
         )
 
     def moved_origin(self, pivot: Array) -> BeamSet:
         """The same beams in coordinates whose origin is ``pivot``."""
         eye = self.eye.copy()
         eye[:, :2] -= pivot
-        return BeamSet(self.rays, self.r, self.start, eye, self.order)
+        return replace(self, eye=eye)
 
     @property
     def p(self) -> Array:

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bimfit.config import SensorConfig
-from bimfit.estimation.result import StationEstimate
+from bimfit.estimation.result import ComponentEstimate, StationEstimate
+from bimfit.geometry.pose import Array
 
 _PARAMETERS = 2.2
 """Degrees of freedom that a component's pose takes from its residuals: u is hardly seen by ranges."""
 _FLOOR = 0.01
-_FEW = 200
+_FEW, _LEAST = 20, 6
+_TAKEN = 0.3
+"""Greatest share of the residuals' power that the fits are held to have taken."""
+_DOUBT = 0.5
+"""Standard deviation of log sigma before a return is seen: what was assumed may be wrong by 1.5."""
+_SHARE_PRIOR = 30.0
+"""Beams' worth of the shares that were assumed."""
+_GATE = 4.0
+"""A return that many assumed sigmas away is no inlier, see :mod:`bimfit.estimation.residuals`."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +41,7 @@ class Noise:
     count : int
         Residuals behind these figures.
     sensor : SensorConfig
-        What to estimate with: sigma / sqrt(f), f = (1 - rho) / (1 + rho), so that correlated neighbours
-        count for what they are worth. Tempering the likelihood as a whole would blunt the edges too.
+        What to estimate with.
     """
 
     sigma: float
@@ -43,47 +52,115 @@ class Noise:
     sensor: SensorConfig
 
 
+@dataclass
+class _Sums:
+    """What is summed over the components of all stations."""
+
+    squares: float = 0.0
+    products: float = 0.0
+    power: float = 0.0
+    gates: float = 0.0
+    fits: float = 0.0
+    pair_fits: float = 0.0
+    count: int = 0
+    covered: int = 0
+    outliers: int = 0
+    misses: int = 0
+
+    def add(self, c: ComponentEstimate, z: Array, gate: float) -> None:
+        """Count one component's residuals ``z``, m, none of which is over ``gate``."""
+        n, r = len(z), c.residuals
+        self.squares += float(z @ z)
+        self.products += float(z[1:] @ z[:-1])
+        self.power += float(z[1:] @ z[1:] + z[:-1] @ z[:-1]) / 2.0
+        self.gates += n * gate * gate
+        self.fits += _PARAMETERS
+        self.pair_fits += _PARAMETERS * (n - 1) / n
+        self.count += n
+        self.covered += r.n_covered
+        self.outliers += round(r.outlier_share * r.n_covered)
+        self.misses += round(r.miss_share * r.n_covered)
+
+
 def estimate_noise(estimates: Sequence[StationEstimate], sensor: SensorConfig) -> Noise:
     """Estimate sigma, the shares and the correlation of neighbours over a joint.
+
+    What was assumed counts as a prior, so that a few returns say little.
 
     Parameters
     ----------
     estimates : sequence of StationEstimate
-        A first pass with ``sensor``; stations that are rejected do not count.
+        A pass with ``sensor``, or one much like it; stations that are rejected do not count.
     sensor : SensorConfig
-        What was assumed; returned unchanged where there are too few residuals to say better.
+        What was assumed; returned unchanged where there are hardly any residuals.
     """
-    squares = freedom = products = power = 0.0
-    covered = outliers = misses = count = 0
-    for station in estimates:
-        for c in station.components:
-            r = c.residuals
-            if c.posterior is None or not c.status.measured or r.n_inliers < 6:
-                continue
-            z = r.residuals / station.growth
-            squares += float(z @ z)
-            freedom += len(z) - _PARAMETERS
-            products += float(z[1:] @ z[:-1])
-            power += float(z[1:] @ z[1:] + z[:-1] @ z[:-1]) / 2.0
-            # a line through k residuals leaves their lag-1 products low by about 2.2 z^2 / k each
-            products += _PARAMETERS * float(z @ z) / len(z)
-            covered += r.n_covered
-            outliers += round(r.outlier_share * r.n_covered)
-            misses += round(r.miss_share * r.n_covered)
-            count += len(z)
-    if count < _FEW or freedom <= 0.0 or power <= 0.0:
-        return Noise(sensor.sigma, sensor.outlier_share, sensor.miss_share, 0.0, count, sensor)
-    sigma = float(np.sqrt(squares / freedom))
-    rho = float(np.clip(products / power, 0.0, 0.95))
-    rho = 0.0 if rho < 2.5 / np.sqrt(count) else rho
-    out = max(outliers / covered, _FLOOR)
-    miss = max(misses / covered, _FLOOR)
-    effective = sigma * float(np.sqrt((1.0 + rho) / (1.0 - rho)))
+    sums = _Sums()
+    for c, z, gate in _seen(estimates):
+        sums.add(c, z, gate)
+    if sums.count < _FEW or sums.power <= 0.0:
+        return Noise(
+            sensor.sigma, sensor.outlier_share, sensor.miss_share, sensor.correlation, sums.count, sensor
+        )
+    variance, rho = _moments(sums)
+    gate = math.sqrt(sums.gates / sums.count)
+    seen = gate * _untruncated(variance / gate**2)
+    share = (1.0 - rho * rho) / (1.0 + rho * rho)
+    weight = 2.0 * share * max(sums.count - sums.fits, 1.0) * _DOUBT**2
+    sigma = sensor.sigma * (seen / sensor.sigma) ** (weight / (1.0 + weight))
+    tail = math.erfc(gate / (seen * math.sqrt(2.0)))
+    strays = max(sums.outliers - sums.count * tail / (1.0 - tail), 0.0)
+    total = sums.covered + _SHARE_PRIOR
+    out = max((strays + _SHARE_PRIOR * sensor.outlier_share) / total, _FLOOR)
+    miss = max((sums.misses + _SHARE_PRIOR * sensor.miss_share) / total, _FLOOR)
     found = replace(
         sensor,
-        sigma=effective,
-        sigma_per_metre=sensor.sigma_per_metre * effective / sensor.sigma,
+        sigma=sigma,
+        sigma_per_metre=sensor.sigma_per_metre * sigma / sensor.sigma,
+        correlation=rho,
         outlier_share=out,
         miss_share=miss,
     )
-    return Noise(sigma, out, miss, rho, count, found)
+    return Noise(sigma, out, miss, rho, sums.count, found)
+
+
+def _seen(estimates: Sequence[StationEstimate]) -> Iterator[tuple[ComponentEstimate, Array, float]]:
+    """Components to learn from, their residuals at no range, m, and what the largest may be."""
+    for station in estimates:
+        for c in station.components:
+            z = c.residuals.residuals / station.growth
+            if c.posterior is not None and c.status.measured and len(z) >= _LEAST:
+                yield c, z, _GATE * station.sensor.sigma / station.growth
+
+
+def _moments(sums: _Sums) -> tuple[float, float]:
+    """Variance of a residual and lag-1 correlation, what the fits have taken out of both put back.
+
+    A smooth curve through k residuals takes the power that they have at low frequencies: (1 + rho) /
+    (1 - rho) times the variance for each of its parameters, from their squares and lag-1 products alike.
+    Never more than is left to it: short faces cannot tell noise that goes together from a shape.
+    """
+    rho, variance = 0.0, sums.squares / sums.count
+    most = max(_TAKEN * sums.count / sums.fits, 1.0)
+    for _ in range(30):
+        taken = min((1.0 + rho) / (1.0 - rho), most)
+        variance = sums.squares / max(sums.count - sums.fits * taken, (1.0 - _TAKEN) * sums.count)
+        lost = sums.pair_fits * taken * variance
+        rho += 0.5 * (float(np.clip((sums.products + lost) / (sums.power + lost), 0.0, 0.95)) - rho)
+    if rho < 2.5 / math.sqrt(sums.count):
+        return sums.squares / max(sums.count - sums.fits, (1.0 - _TAKEN) * sums.count), 0.0
+    return variance, rho
+
+
+def _untruncated(variance: float) -> float:
+    """Standard deviation, at most 1, of the normal whose part within -1 .. 1 has that variance."""
+    low, high = 1e-6, 1.0
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        x = 1.0 / middle
+        inside = math.erf(x / math.sqrt(2.0))
+        density = math.exp(-0.5 * x * x) / math.sqrt(2.0 * math.pi)
+        if middle**2 * (1.0 - 2.0 * x * density / inside) < variance:
+            low = middle
+        else:
+            high = middle
+    return 0.5 * (low + high)

@@ -36,13 +36,18 @@ def residuals_of(
         Range to the other component, which may hide it.
     used : ndarray of bool, shape (n,)
         Beams that may speak for it.
+    sigma : float
+        Standard deviation of a range, m. Where beams differ in it (``beams.spread``), residuals are given as
+        they would be at that sigma.
     """
     n = len(beams)
+    sd = np.full(n, sigma) if beams.spread is None else sigma * beams.spread
     out, z, places = np.empty(kernels.FIGURES), np.empty(n), np.empty((n, 2))
     faces = np.empty(n, np.int64)
     count = kernels.residuals(
         rows, posterior.pose.as_array(), posterior.pivot, posterior.pivot_covariance, met[0], met[1], other,
-        used.copy(), beams.d, beams.r, beams.start, beams.eye, beams.spacing, sigma, out, z, places, faces,
+        used.copy(), beams.d, beams.r, beams.start, beams.eye, beams.spacing, sigma, sd, out, z, places,
+        faces,
     )  # fmt: skip
     f = out.tolist()
     return Residuals(

@@ -71,8 +71,8 @@ def slide_combined(
     scores = np.empty(len(shifts))
     a, b = (edge_rows(component) for component in section.components)
     _kernels.slide(
-        a, b, pose.as_array(), shifts[:, None] * axis, packed(beams, cost, model), beams.start, beams.eye,
-        cost.margin, min(_PRIOR, max(0.8 * gap, 0.010)), scores,
+        a, b, pose.as_array(), shifts[:, None] * axis, packed(beams, cost, model, alike=True), beams.start,
+        beams.eye, cost.margin, min(_PRIOR, max(0.8 * gap, 0.010)), scores,
     )  # fmt: skip
     best = int(np.argmax(scores))
     moved = Pose2D(pose.u + shifts[best] * axis[0], pose.v + shifts[best] * axis[1], pose.theta)

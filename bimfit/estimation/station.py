@@ -32,6 +32,7 @@ from bimfit.estimation.posterior import Posterior, Window, component_posterior
 from bimfit.estimation.residuals import residuals_of
 from bimfit.estimation.result import ComponentEstimate, Residuals, StationEstimate
 from bimfit.estimation.slide import SlideResult, best_start, designed_width
+from bimfit.estimation.spread import with_spread
 from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.pose import Array, Pose2D
 from bimfit.geometry.profile import Profile
@@ -87,36 +88,32 @@ def estimate_station(
     StationEstimate
         Always; what could not be measured has a status that says why and no pose.
     """
-    if sensor.sigma_per_metre > 0.0:
-        distance = typical_range(slice_)
-        fixed = estimate_station(
-            section, slice_, combined, sensor.at(distance), fit,
-            component_matches=component_matches, rivals=rivals,
-        )  # fmt: skip
-        return dataclasses.replace(fixed, growth=sensor.growth(distance))
+    here = _here(sensor, slice_)[0]
     finite = np.isfinite(slice_.points).all(axis=1)
     if int(finite.sum()) < fit.min_points:
         reason = f"{int(finite.sum())} returns in the slice, {fit.min_points} are needed"
-        return _nothing(section, slice_, combined, sensor, Status("no_data", reason))
+        return _nothing(slice_, combined, here, Status("no_data", reason))
     if not finite.all():
         slice_ = dataclasses.replace(slice_, points=slice_.points[finite])
     if section.components[0].empty or section.components[1].empty:
-        return _nothing(
-            section, slice_, combined, sensor, Status("no_data", "the section plane misses a component")
-        )
+        return _nothing(slice_, combined, here, Status("no_data", "the section plane misses a component"))
     if combined is None:
-        return _nothing(
-            section, slice_, None, sensor, Status("rejected", "the search found no pose of the joint")
-        )
+        return _nothing(slice_, None, here, Status("rejected", "the search found no pose of the joint"))
     try:
         best = _estimated(section, slice_, combined, sensor, fit, component_matches, rivals)
     except np.linalg.LinAlgError as error:
         reason = f"the returns do not determine a pose: {error}"
-        return _nothing(section, slice_, combined, sensor, Status("rejected", reason))
+        return _nothing(slice_, combined, here, Status("rejected", reason))
     if not all(_finite(c) for c in best.components):
         reason = "the returns do not determine a pose: its figures are not finite"
-        return _nothing(section, slice_, combined, sensor, Status("rejected", reason))
+        return _nothing(slice_, combined, here, Status("rejected", reason))
     return best
+
+
+def _here(sensor: SensorConfig, slice_: Slice) -> tuple[SensorConfig, float]:
+    """The sensor at a slice's typical range with its neighbours pooled, and that range, m (0: any)."""
+    distance = typical_range(slice_) if sensor.sigma_per_metre > 0.0 else 0.0
+    return sensor.at(distance).pooled(), distance
 
 
 def typical_range(slice_: Slice) -> float:
@@ -147,16 +144,19 @@ def _estimated(
 ) -> StationEstimate:
     """The estimate of a slice that has enough returns and a combined pose."""
     context, reason = _context(section, slice_, combined, sensor, fit)
+    growth = context.sensor.sigma / sensor.pooled().sigma
     beams, sensor = context.beams, context.sensor
     best, cost = _placed(context, slice_, combined, component_matches, rivals, reason)
     best = with_inside(best, section, beams, sensor.sigma, slice_.sweeps)
+    best = dataclasses.replace(best, growth=growth)
     if not best.status.measured or best.combined is None:
         return best
     others = []
     for place in gap_places(section, beams, best.combined):
         there = best_start(section, beams, cost, (place,), sensor, fit)
         other = _components(context, slice_, there, cost, (None, None), reason)
-        others.append(with_inside(other, section, beams, sensor.sigma, slice_.sweeps))
+        other = with_inside(other, section, beams, sensor.sigma, slice_.sweeps)
+        others.append(dataclasses.replace(other, growth=growth))
     return with_lookalikes(best, others, fit.joint_sigma)
 
 
@@ -165,6 +165,7 @@ def _context(
 ) -> tuple[_Context, str]:
     """What every step needs, and why a hole between points is no evidence (empty where it is)."""
     virtual = None
+    own, (sensor, distance) = sensor, _here(sensor, slice_)
     if slice_.beams is None or len(slice_.beams.ranges) == 0:
         virtual = virtual_beams(slice_, section, combined, sensor)
         beams = BeamSet.of(virtual.beams)
@@ -173,6 +174,9 @@ def _context(
     else:
         beams = BeamSet.of(slice_.beams)
     rows = (edge_rows(section.components[0]), edge_rows(section.components[1]))
+    grows = own.sigma_per_metre > 0.0
+    expected = Scene.at(rows, (combined, combined), beams).nearest if grows else None
+    beams = with_spread(beams, own, distance, expected)
     context = _Context(section, beams, rows, BeamModel.of(sensor), sensor, fit, virtual is not None)
     return context, virtual.reason if virtual else ""
 
@@ -198,7 +202,7 @@ def reshaped(
     pose = station.combined
     if pose is None or station.components[which].pose is None:
         return [None] * len(profiles)
-    context, _ = _context(section, slice_, pose, sensor.at(typical_range(slice_)), fit)
+    context, _ = _context(section, slice_, pose, sensor, fit)
     beams = context.beams
     scene = _scene(context, (pose, pose))
     side = split_side(scene, beams, np.array([pose.u, pose.v]))
@@ -252,9 +256,7 @@ def _evidence(estimate: StationEstimate) -> float:
     return sum(c.posterior.evidence for c in estimate.components if c.posterior is not None)
 
 
-def _nothing(
-    section: JointSection, slice_: Slice, combined: Pose2D | None, sensor: SensorConfig, status: Status
-) -> StationEstimate:
+def _nothing(slice_: Slice, combined: Pose2D | None, sensor: SensorConfig, status: Status) -> StationEstimate:
     none = ComponentEstimate(status=status)
     return StationEstimate(slice_.s, combined, (none, none), status, sensor)
 

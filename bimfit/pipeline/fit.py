@@ -50,6 +50,7 @@ METHODS = ("grcsm", "search", "paper", *(name for name in MATCHERS if name != "g
 MOTIONS = ("auto", "independent", "const", "rigid", "linear", "smooth", "kinked")
 """Motion models along the joint."""
 _OTHER_SIGMA, _OTHER_SHARE = 0.1, 0.015
+_NOISE_ROUNDS = 2
 
 
 @dataclass(frozen=True)
@@ -157,7 +158,7 @@ def fit_slices(
     noise = None
     if method == "grcsm":
         noise = estimate_noise([fit.estimate for fit in fits if fit.estimate is not None], config.sensor)
-        fits = _with_noise(fits, noise, config)
+        fits, noise = _with_noise(fits, noise, config.sensor, config)
         if config.shape.freedoms:
             fits, noise = _with_shape(fits, noise, config)
         fits = _with_company(fits, noise)
@@ -267,23 +268,28 @@ def _fit_stations(
     return fits
 
 
-def _with_noise(fits: list[StationFit], noise: Noise, config: Config) -> list[StationFit]:
-    """Estimate again where the joint's own residuals say that the sensor is not as it was assumed to be."""
-    if not config.sensor.adapt or not _differs(noise.sensor, config.sensor):
-        return fits
-    again = []
-    for fit in fits:
-        begin = time.perf_counter()
-        estimate = _estimate(fit, noise.sensor, config)
-        again.append(
-            dataclasses.replace(fit, estimate=estimate, seconds=fit.seconds + time.perf_counter() - begin)
-        )
-    return again
+def _with_noise(
+    fits: list[StationFit], noise: Noise, assumed: SensorConfig, config: Config
+) -> tuple[list[StationFit], Noise]:
+    """Estimate again while the joint's own residuals say that the sensor is not as it was assumed to be."""
+    for _ in range(_NOISE_ROUNDS if config.sensor.adapt else 0):
+        if not _differs(noise.sensor, assumed):
+            break
+        assumed = noise.sensor
+        fits = [_estimated(fit, assumed, config) for fit in fits]
+        noise = estimate_noise([fit.estimate for fit in fits if fit.estimate is not None], assumed)
+    return fits, noise
+
+
+def _estimated(fit: StationFit, sensor: SensorConfig, config: Config) -> StationFit:
+    begin = time.perf_counter()
+    estimate = _estimate(fit, sensor, config)
+    return dataclasses.replace(fit, estimate=estimate, seconds=fit.seconds + time.perf_counter() - begin)
 
 
 def _differs(found: SensorConfig, assumed: SensorConfig) -> bool:
     return (
-        abs(math.log(found.sigma / assumed.sigma)) > _OTHER_SIGMA
+        abs(math.log(found.pooled().sigma / assumed.pooled().sigma)) > _OTHER_SIGMA
         or abs(found.outlier_share - assumed.outlier_share) > _OTHER_SHARE
         or abs(found.miss_share - assumed.miss_share) > _OTHER_SHARE
     )
@@ -293,9 +299,9 @@ def _with_shape(fits: list[StationFit], noise: Noise, config: Config) -> tuple[l
     """Free the components' shapes, and estimate again with them."""
     sensor = noise.sensor if config.sensor.adapt else config.sensor
     fits = free_shapes(fits, sensor, config)
-    fits = [dataclasses.replace(fit, estimate=_estimate(fit, sensor, config)) for fit in fits]
+    fits = [_estimated(fit, sensor, config) for fit in fits]
     noise = estimate_noise([fit.estimate for fit in fits if fit.estimate is not None], sensor)
-    return _with_noise(fits, noise, config), noise
+    return _with_noise(fits, noise, sensor, config)
 
 
 def _judged(fit: StationFit, shape: StationShape) -> StationFit:

@@ -45,7 +45,8 @@ def test_what_was_simulated_comes_back(scan, sigma, rho, miss, outlier):
     assert noise.correlation == pytest.approx(rho, abs=0.08)
     assert noise.miss_share == pytest.approx(miss, abs=0.012)
     assert noise.outlier_share == pytest.approx(outlier, abs=0.012)
-    assert noise.sensor.sigma == pytest.approx(
+    assert (noise.sensor.sigma, noise.sensor.correlation) == (noise.sigma, noise.correlation)
+    assert noise.sensor.pooled().sigma == pytest.approx(
         noise.sigma * np.sqrt((1 + noise.correlation) / (1 - noise.correlation))
     )
 
