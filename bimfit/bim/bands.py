@@ -1,7 +1,8 @@
-"""The middle line of a strip that is not a rectangle: an arc, an L, a frame."""
+"""Middle lines of a strip that is not a rectangle: of an arc, an L, a frame; of the arms of an I."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,10 @@ _HEAL = 1e-4
 _LATTICE = 1e-6
 _SIMPLIFY = 2e-4
 _END_TURN = np.radians(45.0)
+_OFF_LINE = 0.1
+_OPPOSITE = 0.9999
+_ARM_LENGTH = 1.5
+_ARMS_SHARE = 2.0 / 3.0
 
 
 def middle_line(polygons: list[Array], *, max_depth: float) -> tuple[Array, bool] | None:
@@ -27,12 +32,8 @@ def middle_line(polygons: list[Array], *, max_depth: float) -> tuple[Array, bool
     """
     import shapely
 
-    corners = np.round(np.concatenate(polygons) / _LATTICE) * _LATTICE
-    which = np.repeat(np.arange(len(polygons)), [len(p) for p in polygons])
-    merged = _union(shapely.polygons(shapely.linearrings(corners, indices=which))).simplify(_SIMPLIFY)
-    if merged.geom_type == "MultiPolygon":
-        merged = max(merged.geoms, key=lambda g: g.area)
-    if merged.is_empty or merged.geom_type != "Polygon":
+    merged = _region(polygons)
+    if merged is None:
         return None
     holes = [ring for ring in merged.interiors if shapely.Polygon(ring).area > 0.05 * merged.area]
     if len(holes) > 1:
@@ -47,9 +48,82 @@ def middle_line(polygons: list[Array], *, max_depth: float) -> tuple[Array, bool
         return None
     length = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
     depth = merged.area / length
-    if depth > max_depth or length < 2.0 * depth:
+    if depth > max_depth or length < 2.0 * depth or _branches(merged, line, depth):
         return None
     return line, bool(holes)
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A straight arm of a region: its middle line, shape (2, 2), and how deep it is across it, m."""
+
+    line: Array
+    depth: float
+
+    @property
+    def length(self) -> float:
+        """Of the line, m."""
+        return float(np.linalg.norm(self.line[1] - self.line[0]))
+
+
+def straight_arms(polygons: list[Array]) -> list[Arm]:
+    """The straight arms of a branched region of convex polygons (k, 2), such as flanges and web of an I.
+
+    An arm lies between two edges that run opposite ways with the region between them, and is longer than
+    deep by half or more. Arms that leave more than a third of the region out are not what it is made of:
+    then there are none.
+    """
+    merged = _region(polygons)
+    if merged is None or merged.interiors:
+        return []
+    ring = _ring(merged.exterior, counter_clockwise=True)
+    edge = np.roll(ring, -1, axis=0) - ring
+    size = np.linalg.norm(edge, axis=1)
+    unit = edge / np.maximum(size, 1e-12)[:, None]
+    arms: list[Arm] = []
+    for i, j in np.argwhere(np.triu(unit @ unit.T < -_OPPOSITE, 1)):
+        arm = _arm(ring[i], unit[i], size[i], ring[j], ring[(j + 1) % len(ring)])
+        if arm is not None and merged.buffer(_SIMPLIFY).covers(_box_about(arm)):
+            arms.append(arm)
+    covered = sum(arm.length * arm.depth for arm in arms)
+    return arms if covered >= _ARMS_SHARE * merged.area else []
+
+
+def _arm(start: Array, unit: Array, size: float, far: Array, near: Array) -> Arm | None:
+    """What lies between an edge and another one that runs the opposite way, on its left."""
+    t = np.array([0.0, size, *sorted(((near - start) @ unit, (far - start) @ unit))])
+    low, high = max(t[0], t[2]), min(t[1], t[3])
+    normal = np.array([-unit[1], unit[0]])
+    depth = float(0.5 * (near + far - 2.0 * start) @ normal)
+    if depth <= 0.0 or high - low < _ARM_LENGTH * depth:
+        return None
+    return Arm(start + 0.5 * depth * normal + np.outer([low, high], unit), depth)
+
+
+def _box_about(arm: Arm) -> Any:
+    import shapely
+
+    return shapely.LineString(arm.line).buffer(0.5 * arm.depth, cap_style="flat")
+
+
+def _region(polygons: list[Array]) -> Any:
+    """The polygons as one, the largest where they are several; None where nothing is left."""
+    import shapely
+
+    corners = np.round(np.concatenate(polygons) / _LATTICE) * _LATTICE
+    which = np.repeat(np.arange(len(polygons)), [len(p) for p in polygons])
+    merged = _union(shapely.polygons(shapely.linearrings(corners, indices=which))).simplify(_SIMPLIFY)
+    if merged.geom_type == "MultiPolygon":
+        merged = max(merged.geoms, key=lambda g: g.area)
+    return merged if merged.geom_type == "Polygon" and not merged.is_empty else None
+
+
+def _branches(region: Any, line: Array, depth: float) -> bool:
+    """Whether a part of the region lies further off the line than the depth."""
+    import shapely
+
+    near = shapely.LineString(line).buffer(depth, cap_style="square", join_style="mitre")
+    return bool(region.difference(near).area > _OFF_LINE * region.area)
 
 
 def _union(pieces: Any) -> Any:

@@ -22,6 +22,8 @@ _INSIDE = 1e-4
 _OWN = 3e-4
 _END = 1e-3
 _ROWS = 1_000_000
+_STANDS_OUT = 0.01
+_ACROSS = (-0.25, 0.0, 0.25)
 
 
 @dataclass(frozen=True)
@@ -155,6 +157,47 @@ def _hits(
         np.concatenate([f[1] for f in found]),
         np.concatenate([f[2] for f in found]),
     )
+
+
+def covered_sides(
+    faces: Faces, origin: Array, u: Array, v: Array, depth: Array, gap: Array, filler: Index
+) -> NDArray[np.bool_]:
+    """Whether the filler stands out of the gap by more than 10 mm, towards +v and -v: shape (k, 2).
+
+    So do plates and slabs that lie between two elements, and no sealant or mortar. It is looked for in the
+    middle of the gap and halfway to either face.
+
+    Parameters
+    ----------
+    origin, u, v : ndarray, shape (k, stations, 3)
+        Mid-gap points, directions across and out of the gap; the majority of the points decides.
+    depth, gap : ndarray, shape (k,)
+        m.
+    filler : ndarray, shape (k,)
+        Elements; -1 for none.
+    """
+    out = np.zeros((len(filler), 2), bool)
+    filled = np.flatnonzero(filler >= 0)
+    for shift in _ACROSS if len(filled) else ():
+        start = origin[filled] + shift * gap[filled, None, None] * u[filled]
+        out[filled] |= _stands_out(faces, start, v[filled], depth[filled], filler[filled])
+    return out
+
+
+def _stands_out(faces: Faces, start: Array, v: Array, depth: Array, filler: Index) -> NDArray[np.bool_]:
+    k, count, _ = start.shape
+    element = np.repeat(filler, count)
+    sizes = np.diff(faces.starts)[element]
+    row, triangle = np.repeat(np.arange(k * count), sizes), ranges(faces.starts[element], sizes)
+    distance = ray_distance(start.reshape(-1, 3)[row], v.reshape(-1, 3)[row], faces.triangles[triangle])
+    beyond = 0.5 * depth[row // count] + _STANDS_OUT
+    out = np.zeros((k, 2), bool)
+    for side, sign in ((0, 1.0), (1, -1.0)):
+        # a point lies within a body when an odd number of its faces lie further out
+        crossed = np.isfinite(distance) & (sign * distance > beyond)
+        inside = np.bincount(row[crossed], minlength=k * count) % 2 == 1
+        out[:, side] = inside.reshape(k, count).sum(axis=1) * 2 > count
+    return out
 
 
 def nearby_triangles(faces: Faces, low: Array, high: Array) -> tuple[Index, Index]:

@@ -10,12 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bimfit.bim.bands import middle_line
+from bimfit.bim.bands import middle_line, straight_arms
 from bimfit.bim.broad import face_pairs
-from bimfit.bim.clearance import judge
+from bimfit.bim.clearance import covered_sides, judge
 from bimfit.bim.faces import Faces, Index, cross, dot, find_faces, overlapping, ranges
 from bimfit.bim.kind import Stations, classify, free_sides
-from bimfit.bim.merge import Leg, merge
+from bimfit.bim.legs import Leg
+from bimfit.bim.merge import merge
 from bimfit.bim.narrow import PairFrames, facing_pieces, pair_frames
 from bimfit.bim.strips import Strips, find_strips
 from bimfit.geometry.mesh import TriangleMesh
@@ -117,16 +118,16 @@ def _legs(faces: Faces, frames: PairFrames, strips: Strips, limits: Limits) -> d
     full = strips.area >= _FULL * strips.length * strips.depth
     groups: dict[Key, list[Leg]] = defaultdict(list)
     for k, key in enumerate(zip(first, second, state.tolist(), filler.tolist(), strict=True)):
-        points, u, depth, length, closed = ends[k], m[k : k + 1], depths[k], lengths[k], False
-        band = None if full[k] else _band(strips, k)
-        if band is not None:
-            line, closed = band
-            pair = np.full(len(line), strips.pair[k])
-            points, u = _mid_gap(frames, pair, line), np.repeat(u, len(line) - 1, axis=0)
+        gap = gaps[k], lows[k], highs[k]
+        lines = [] if full[k] else _lines(strips, k)
+        if not lines:
+            leg = Leg(ends[k], m[k : k + 1], lengths[k], depths[k], *gap, areas[k], (lengths[k],))
+            groups[key].append(leg)
+        for line, depth, closed in lines:
+            points = _mid_gap(frames, np.full(len(line), strips.pair[k]), line)
+            u = np.repeat(m[k : k + 1], len(line) - 1, axis=0)
             length = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
-            depth = areas[k] / length
-        leg = Leg(points, u, length, depth, gaps[k], lows[k], highs[k], areas[k], (length,), closed)
-        groups[key].append(leg)
+            groups[key].append(Leg(points, u, length, depth, *gap, depth * length, (length,), closed))
     return groups
 
 
@@ -135,10 +136,17 @@ def _mid_gap(frames: PairFrames, pair: Index, points: Array) -> Array:
     return frames.lift(pair, points, 0.5 * (low + high)[:, 0])
 
 
-def _band(strips: Strips, k: int) -> tuple[Array, bool] | None:
+def _lines(strips: Strips, k: int) -> list[tuple[Array, float, bool]]:
+    """Middle lines of a strip that is no rectangle, with depths and whether they are closed; else nothing."""
     rows = slice(int(strips.splits[k]), int(strips.splits[k + 1]))
     pieces = zip(strips.pieces.corners[rows], strips.pieces.count[rows], strict=True)
-    return middle_line([corners[:count] for corners, count in pieces], max_depth=_BAND_DEPTH)
+    polygons = [corners[:count] for corners, count in pieces]
+    band = middle_line(polygons, max_depth=_BAND_DEPTH)
+    if band is None:
+        return [(arm.line, arm.depth, False) for arm in straight_arms(polygons)]
+    line, closed = band
+    length = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
+    return [(line, float(strips.area[k]) / length, closed)]
 
 
 def _add_grooves(
@@ -202,7 +210,7 @@ def _finish(faces: Faces, rows: Sequence[tuple[Key, Leg]]) -> list[Draft]:
     n, u, v = _axes(end - start, np.array([leg.u[i] for leg, i in zip(legs, picks, strict=True)]))
     depth = np.array([leg.depth for leg in legs])
     stations = Stations(
-        origin=start + _MID * (end - start),
+        origin=start + _MID * (end - start) + _lead(legs, u, v),
         u=u,
         v=v,
         n=n,
@@ -215,13 +223,11 @@ def _finish(faces: Faces, rows: Sequence[tuple[Key, Leg]]) -> list[Draft]:
         faces, stations, np.array([leg.length for leg in legs]), np.array([leg.area for leg in legs])
     )
     spots = _spots(legs, start, end, u, v)
-    free = free_sides(
-        faces,
-        *spots,
-        depth + 2.0 * shape.prepared,
-        stations.gap,
-        np.array([key[3] for key, _ in rows]),
-    )
+    filler = np.array([key[3] for key, _ in rows])
+    way = (*spots, depth + 2.0 * shape.prepared, stations.gap, filler)
+    free = free_sides(faces, *way)
+    _free_past_lips(faces, legs, spots, stations.gap, filler, free)
+    free &= ~covered_sides(faces, *way)
     flip = _default_mouth(free, shape.opening, v, stations.origin)
     out = []
     for k, (key, leg) in enumerate(rows):
@@ -233,6 +239,37 @@ def _finish(faces: Faces, rows: Sequence[tuple[Key, Leg]]) -> list[Draft]:
         sides = sides[::-1] if flip[k] else sides
         out.append(Draft(key[0], key[1], key[2], key[3], str(shape.kind[k]), whole, path, sides))
     return out
+
+
+def _lead(legs: Sequence[Leg], u: Array, v: Array) -> Array:
+    """From the spine to the middle of the leading faces, shape (k, 3): not zero for stepped sections only."""
+    place = np.array(
+        [(0.0, 0.0) if leg.lips is None else (leg.lips[1].across, leg.lips[1].out) for leg in legs]
+    )
+    return np.asarray(place[:, :1] * u + place[:, 1:] * v)
+
+
+def _free_past_lips(
+    faces: Faces,
+    legs: Sequence[Leg],
+    spots: tuple[Array, Array, Array],
+    gap: Array,
+    filler: Index,
+    free: NDArray[np.bool_],
+) -> None:
+    """Look again out of stepped gaps, into ``free``: each way from the outermost faces, straight on."""
+    stepped = np.array([k for k, leg in enumerate(legs) if leg.lips is not None], np.int64)
+    if not len(stepped):
+        return
+    origin, u, v = (values[stepped] for values in spots)
+    for side, which in ((0, 2), (1, 0)):
+        lips = [leg.lips[which] for leg in legs if leg.lips is not None]
+        across, out = (
+            np.array(x)[:, None, None] for x in zip(*((lip.across, lip.out) for lip in lips), strict=True)
+        )
+        depth = np.array([lip.depth for lip in lips])
+        at_lip = origin + across * u + out * v
+        free[stepped, side] = free_sides(faces, at_lip, u, v, depth, gap[stepped], filler[stepped])[:, side]
 
 
 def _longest(leg: Leg) -> int:

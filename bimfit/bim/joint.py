@@ -20,6 +20,7 @@ Kind = Literal[
     "lap",
     "t-joint",
     "corner",
+    "rebate",
     "sheet",
     "patch",
 ]
@@ -35,6 +36,7 @@ KINDS: tuple[Kind, ...] = (
     "lap",  # faces that lie over one another
     "t-joint",  # an edge against the middle of a face
     "corner",  # an edge against the rim of a face
+    "rebate",  # edges with a step in them: rebated, halved, tongue and groove, keyed
     "sheet",  # large faces parallel to one another, as layers of a wall are
     "patch",  # a contact about as short as it is deep
 )
@@ -54,7 +56,7 @@ class Joint:
         One of ``KINDS``.
     width : float
         Mean designed gap between the facing faces, m; negative where they overlap. Of a groove with a root
-        land it is the gap between the lands.
+        land it is the gap between the lands, of a stepped section that of its narrowest faces.
     length, depth : float
         Along the joint and out of its mouth, m. The length is that of the faces that meet, which at corners
         is less than the path's. The depth of a groove includes its prepared edges.

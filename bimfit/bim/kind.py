@@ -16,6 +16,8 @@ _SIDE = 0.06
 _ON_LINE = 5e-4
 _AT_CORNER = 5e-4
 _OVERHANG = 3e-3
+_STEP_SLACK = 5e-3
+_JUTTING = 0.5
 _SLANT = np.radians(15.0)
 _TAPER = np.radians(1.5)
 _STEEP = np.radians(10.5)
@@ -86,12 +88,13 @@ def classify(faces: Faces, stations: Stations, length: Array, area: Array) -> Sh
         )
         top[:, :, e] = flat
     common_low, common_high = np.fmax(top[:, 0, 0], top[:, 1, 0]), np.fmin(top[:, 0, 1], top[:, 1, 1])
-    angle, turned = _corners(row, side, ends, slope, level, top)
+    angle, turned, inner = _corners(row, side, ends, slope, level, top)
     taper = np.arctan(slope[:, 1]) - np.arctan(slope[:, 0])
     turned = np.where(_prepared(angle, taper), turned, 0.0)
     over = _overhangs(top, angle, turned, stations.gap)
     depth = np.where(np.isfinite(common_high - common_low), common_high - common_low, stations.depth)
     kind = _name(over, angle, turned, taper, np.maximum(depth, 1e-6))
+    kind[_stepped(top, inner, stations.gap)] = "rebate"
     kind[(stations.depth >= _SHEET_DEPTH) & (area >= _SHEET_AREA)] = "sheet"
     kind[(length < 1.2 * stations.depth) & (length < _PATCH)] = "patch"
     prepared = turned.sum(axis=1)
@@ -110,6 +113,15 @@ def _prepared(angle: Array, taper: Array) -> NDArray[np.bool_]:
     blunt, sharp = angle > np.pi / 2.0 + _SLANT, angle < np.pi / 2.0 - _SLANT
     plain = blunt & ~sharp[:, ::-1] & ~sharp[:, :, ::-1]
     return np.asarray(plain & (np.abs(taper) <= _STEEP)[:, None, None])
+
+
+def _stepped(top: Array, inner: NDArray[np.bool_], gap: Array) -> NDArray[np.bool_]:
+    """Whether the section goes on round a step, shape (k,).
+
+    One face ends in an inner corner, where its element juts out across the gap, the other ends near by.
+    """
+    near = np.abs(top[:, 0] - top[:, 1]) <= 1.5 * np.abs(gap)[:, None] + _STEP_SLACK
+    return np.asarray((inner.any(axis=1) & near).any(axis=1))
 
 
 def _overhangs(top: Array, angle: Array, turned: Array, gap: Array) -> NDArray[np.bool_]:
@@ -216,10 +228,15 @@ def _collinear(row: Index, side: Index, ends: Array, slope: Array, level: Array)
 
 def _corners(
     row: Index, side: Index, ends: Array, slope: Array, level: Array, top: Array
-) -> tuple[Array, Array]:
-    """Interior angle at each face's ends, rad, and how far in v the next edge goes on, m: (k, side, end)."""
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Interior angle at each face's ends, rad, how far in v the next edge goes on, m, whether it juts out.
+
+    All of shape (k, side, end). At an inner corner the next edge comes out of the face, into the gap: such an
+    end counts as square and not prepared.
+    """
     k = len(slope)
     angle, turned = np.full((k, 2, 2), np.pi / 2.0), np.zeros((k, 2, 2))
+    inner = np.zeros((k, 2, 2), bool)
     off_line = ~_collinear(row, side, ends, slope, level)
     for e, sign in ((0, -1.0), (1, 1.0)):
         v = top[:, :, e]
@@ -237,11 +254,14 @@ def _corners(
         unit = away[first] / np.maximum(size[first, None], 1e-12)
         inward = np.stack([slope[i, j], np.ones(len(i))], axis=1) * -sign
         inward /= np.linalg.norm(inward, axis=1, keepdims=True)
-        angle[i, j, e] = np.arccos(np.clip(np.einsum("ij,ij->i", unit, inward), -1.0, 1.0))
-        turned[i, j, e] = _run(row, side, ends, (i, j), corner[i, j], unit) * np.maximum(
-            sign * unit[:, 1], 0.0
-        )
-    return angle, turned
+        run = _run(row, side, ends, (i, j), corner[i, j], unit)
+        across = np.where(j == 0, 1.0, -1.0) * (unit[:, 0] - slope[i, j] * unit[:, 1])
+        juts = across > _JUTTING
+        inner[i, j, e] = juts & (run * across > _OVERHANG)
+        bent = np.arccos(np.clip(np.einsum("ij,ij->i", unit, inward), -1.0, 1.0))
+        angle[i, j, e] = np.where(juts, np.pi / 2.0, bent)
+        turned[i, j, e] = np.where(juts, 0.0, run * np.maximum(sign * unit[:, 1], 0.0))
+    return angle, turned, inner
 
 
 def _run(

@@ -2,75 +2,17 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
 
+from bimfit.bim.legs import HOLE, NEARLY_PARALLEL, SNAP, Leg, likely_pairs
+from bimfit.bim.steps import join_steps
 from bimfit.geometry.pose import Array
 
 _PARALLEL = 0.9998
-_STEP_PARALLEL = 0.998
-_HOLE = 0.05
-_SNAP = 1e-3
-_COMMON = 0.8
 _FACET_TURN = (0.004, 0.45)
-
-
-@dataclass(frozen=True)
-class Leg:
-    """A run of facing faces, or several of them end to end.
-
-    Attributes
-    ----------
-    points : ndarray, shape (k, 3)
-        Mid-gap line, m.
-    u : ndarray, shape (k - 1, 3)
-        Directions from A to B.
-    length, depth, gap, low, high, area : float
-        Of the faces that meet: m and m^2; least and greatest gap.
-    legs : tuple of float
-        Length of each run.
-    closed : bool
-    groove : bool
-        Found as a pair of prepared edges without a root land.
-    """
-
-    points: Array
-    u: Array
-    length: float
-    depth: float
-    gap: float
-    low: float
-    high: float
-    area: float
-    legs: tuple[float, ...]
-    closed: bool = False
-    groove: bool = False
-
-    @cached_property
-    def way(self) -> Array:
-        """Direction from the first point to the last."""
-        d = self.points[-1] - self.points[0]
-        return np.asarray(d / np.linalg.norm(d))
-
-    @cached_property
-    def middle(self) -> Array:
-        """Mean of the points."""
-        return np.asarray(self.points.mean(axis=0))
-
-    @cached_property
-    def side(self) -> Array:
-        """Out of the gap: direction of the depth on the first run."""
-        (a, b, c), (x, y, z) = self.way, self.u[0]
-        return np.array([b * z - c * y, c * x - a * z, a * y - b * x])
-
-    @property
-    def straight(self) -> bool:
-        """Whether it has two points only."""
-        return len(self.points) == 2
 
 
 def merge(legs: Sequence[Leg]) -> list[Leg]:
@@ -79,58 +21,15 @@ def merge(legs: Sequence[Leg]) -> list[Leg]:
         return list(legs)
     out = _turn_facets(list(legs))
     out = _join_collinear(out)
-    out = _join_steps(out)
+    out = join_steps(out)
     return _join_ends(out)
-
-
-def _likely(
-    legs: Sequence[Leg], *, parallel: float, turn: tuple[float, float], near: bool = False, row: bool = False
-) -> list[tuple[int, int]]:
-    """Pairs of straight legs whose axes are parallel and whose u directions have a cosine within ``turn``.
-
-    With ``near``, their sections also lie within reach of one another; with ``row``, they may be runs of one
-    strip.
-    """
-    way = np.array([leg.way for leg in legs])
-    u = np.array([leg.u[0] for leg in legs])
-    straight = np.array([leg.straight for leg in legs])
-    cosine = u @ u.T
-    good = (np.abs(way @ way.T) >= parallel) & (cosine >= turn[0]) & (cosine <= turn[1])
-    good &= straight[:, None] & straight[None, :]
-    if near:
-        middle = np.array([leg.middle for leg in legs])
-        depth, gap = np.array([leg.depth for leg in legs]), np.abs([leg.gap for leg in legs])
-        apart = middle[None] - middle[:, None]
-        along = np.einsum("ijk,ik->ij", apart, way)
-        half = 0.5 * np.array([np.linalg.norm(leg.points[-1] - leg.points[0]) for leg in legs])
-        length = np.array([leg.length for leg in legs])
-        # a little more than what decides, which is measured along the first one's way
-        common = half[:, None] + half - np.abs(along) * 0.999 + 1e-6
-        good &= common >= 0.99 * _COMMON * np.minimum(length[:, None], length)
-        apart = apart - along[..., None] * way[:, None]
-        reach = 0.5 * (depth[:, None] + depth) + 1.5 * np.maximum(gap[:, None], gap) + 5e-3
-        good &= np.linalg.norm(apart, axis=2) <= reach + 0.01 * np.maximum(depth[:, None], depth)
-    if row:
-        middle, side = np.array([leg.middle for leg in legs]), np.array([leg.side for leg in legs])
-        depth, gap = np.array([leg.depth for leg in legs]), np.array([leg.gap for leg in legs])
-        apart, deeper = middle[None] - middle[:, None], np.maximum(depth[:, None], depth)
-        half = 0.5 * np.array([np.linalg.norm(leg.points[-1] - leg.points[0]) for leg in legs])
-        hole = np.abs(np.einsum("ijk,ik->ij", apart, way)) - half[:, None] - half
-        # a little more than what decides, which is measured square to the first one's way
-        loose = 0.02 * np.linalg.norm(apart, axis=2) + 1e-6
-        good &= np.abs(np.einsum("ijk,ik->ij", apart, u)) <= _SNAP + loose
-        good &= np.abs(np.einsum("ijk,ik->ij", apart, side)) <= 0.1 * deeper + loose
-        good &= (hole >= -0.005 - loose) & (hole <= _HOLE + loose)
-        good &= np.abs(depth[:, None] - depth) <= 0.2 * deeper + 1e-9
-        good &= np.abs(gap[:, None] - gap) <= 2.0 * _SNAP + 1e-9
-    return [(int(i), int(j)) for i, j in np.argwhere(np.triu(good, 1))]
 
 
 def _turn_facets(legs: list[Leg]) -> list[Leg]:
     """Facets of a curve that are deeper than they are long: let their axes follow the curve."""
     links: dict[int, list[int]] = {i: [] for i in range(len(legs))}
     turn = (float(np.cos(_FACET_TURN[1])), float(np.cos(_FACET_TURN[0])))
-    for i, j in _likely(legs, parallel=_STEP_PARALLEL, turn=turn, near=True):
+    for i, j in likely_pairs(legs, parallel=NEARLY_PARALLEL, turn=turn, near=True):
         if _neighbours_across(legs[i], legs[j]):
             links[i].append(j)
             links[j].append(i)
@@ -161,7 +60,7 @@ def _turned(leg: Leg) -> Leg:
 def _neighbours_across(a: Leg, b: Leg) -> bool:
     """Whether two strips lie side by side along their long sides and turn a little about them."""
     turn = float(np.arccos(np.clip(a.u[0] @ b.u[0], -1.0, 1.0)))
-    if not _FACET_TURN[0] < turn < _FACET_TURN[1] or abs(a.way @ b.way) < _STEP_PARALLEL:
+    if not _FACET_TURN[0] < turn < _FACET_TURN[1] or abs(a.way @ b.way) < NEARLY_PARALLEL:
         return False
     apart = b.middle - a.middle
     along = abs(float(apart @ a.way))
@@ -176,7 +75,7 @@ def _join_collinear(legs: list[Leg]) -> list[Leg]:
     done = False
     while not done:
         done = True
-        for i, j in _likely(legs, parallel=_PARALLEL, turn=(_PARALLEL, 1.1), row=True):
+        for i, j in likely_pairs(legs, parallel=_PARALLEL, turn=(_PARALLEL, 1.1), row=True):
             joined = _collinear(legs[i], legs[j])
             if joined is not None:
                 legs = [leg for k, leg in enumerate(legs) if k not in (i, j)] + [joined]
@@ -191,13 +90,13 @@ def _collinear(a: Leg, b: Leg) -> Leg | None:
     way = a.way
     offset = b.middle - a.middle
     beside = offset - (offset @ way) * way
-    if abs(beside @ a.u[0]) > _SNAP or abs(beside @ a.side) > 0.1 * max(a.depth, b.depth):
+    if abs(beside @ a.u[0]) > SNAP or abs(beside @ a.side) > 0.1 * max(a.depth, b.depth):
         return None
-    if abs(a.depth - b.depth) > 0.2 * max(a.depth, b.depth) or abs(a.gap - b.gap) > 2.0 * _SNAP:
+    if abs(a.depth - b.depth) > 0.2 * max(a.depth, b.depth) or abs(a.gap - b.gap) > 2.0 * SNAP:
         return None
     ta, tb = np.sort((a.points - a.points[0]) @ way), np.sort((b.points - a.points[0]) @ way)
     hole = max(ta[0], tb[0]) - min(ta[1], tb[1])
-    if not -0.005 <= hole <= _HOLE:
+    if not -0.005 <= hole <= HOLE:
         return None
     low, high = min(ta[0], tb[0]), max(ta[1], tb[1])
     length = a.length + b.length
@@ -212,60 +111,6 @@ def _collinear(a: Leg, b: Leg) -> Leg | None:
         area=a.area + b.area,
         legs=(length,),
     )
-
-
-def _join_steps(legs: list[Leg]) -> list[Leg]:
-    """Join strips beside one another into one stepped section, led by the largest."""
-    legs = sorted(legs, key=lambda leg: -leg.area)
-    beside: dict[int, set[int]] = defaultdict(set)
-    for i, j in _likely(legs, parallel=_STEP_PARALLEL, turn=(-0.2, 1.1), near=True):
-        if _steps(legs[i], legs[j]):
-            beside[i].add(j)
-            beside[j].add(i)
-    out: list[Leg] = []
-    taken = [False] * len(legs)
-    for i, main in enumerate(legs):
-        if taken[i]:
-            continue
-        taken[i] = True
-        group, queue = [main], [i]
-        while queue:
-            for j in sorted(beside[queue.pop()]):
-                if not taken[j]:
-                    taken[j] = True
-                    group.append(legs[j])
-                    queue.append(j)
-        out.append(_stepped(main, group))
-    return out
-
-
-def _steps(a: Leg, b: Leg) -> bool:
-    if not (a.straight and b.straight) or abs(a.way @ b.way) < _STEP_PARALLEL or a.u[0] @ b.u[0] < -0.2:
-        return False
-    way = a.way
-    ta, tb = np.sort(a.points @ way), np.sort(b.points @ way)
-    common = min(ta[1], tb[1]) - max(ta[0], tb[0])
-    if common < _COMMON * min(a.length, b.length):
-        return False
-    ends = []
-    for leg in (a, b):
-        middle, side = leg.middle, leg.side
-        ends.append(np.stack([middle - 0.5 * leg.depth * side, middle + 0.5 * leg.depth * side]))
-    apart = ends[0][:, None] - ends[1][None]
-    apart = apart - (apart @ way)[..., None] * way
-    return float(np.linalg.norm(apart, axis=2).min()) < 1.5 * max(abs(a.gap), abs(b.gap)) + 5e-3
-
-
-def _stepped(main: Leg, group: Sequence[Leg]) -> Leg:
-    if len(group) == 1:
-        return main
-    side, spans = main.side, []
-    for leg in group:
-        middle = float((leg.middle - main.points[0]) @ side)
-        half = 0.5 * leg.depth * abs(float(leg.side @ side))
-        spans.append((middle - half, middle + half))
-    depth = max(span[1] for span in spans) - min(span[0] for span in spans)
-    return replace(main, depth=max(depth, main.depth), area=sum(leg.area for leg in group))
 
 
 def _join_ends(legs: list[Leg]) -> list[Leg]:
@@ -301,7 +146,11 @@ def _join_ends(legs: list[Leg]) -> list[Leg]:
 
 
 def _reversed(leg: Leg) -> Leg:
-    return replace(leg, points=leg.points[::-1].copy(), u=leg.u[::-1].copy(), legs=leg.legs[::-1])
+    lips = leg.lips
+    if lips is not None:
+        lips = (lips[2].mirrored(), lips[1].mirrored(), lips[0].mirrored())
+    points, u = leg.points[::-1].copy(), leg.u[::-1].copy()
+    return replace(leg, points=points, u=u, legs=leg.legs[::-1], lips=lips)
 
 
 def _near_ends(legs: Sequence[Leg], open_: Sequence[int]) -> list[tuple[int, int, int, int]]:
@@ -358,6 +207,7 @@ def _chained(chain: Sequence[Leg], *, closed: bool) -> Leg:
         legs=tuple(x for leg in chain for x in leg.legs),
         closed=closed,
         groove=chain[0].groove,
+        lips=chain[0].lips,
     )
 
 
