@@ -18,6 +18,7 @@ from bimfit.geometry.pose import Array, rigid_inverse
 from bimfit.pipeline.targets import match_reach
 from bimfit.scan.boxes import Boxes
 from bimfit.scan.cloud import PointCloud
+from bimfit.scan.formats import unit_taken
 from bimfit.scan.formats.options import ANY, ReadOptions, unit_name
 from bimfit.scan.formats.summary import seen_from
 from bimfit.scan.nearby import Gatherer, Nearby, read_ahead
@@ -296,7 +297,7 @@ def _other_unit(places: Boxes, T: Array, factor: float) -> Boxes:
 
 
 def _unit_error(path: Path, model: Model, factor: float, name: str, placing: Placing) -> ScanError:
-    unit = unit_name((placing.options.unit or 1.0) * factor)
+    unit = unit_name(unit_taken(path, placing.options) * factor)
     frame = f", in {name} coordinates" if model.georeference is not None else ""
     if any("is its unit" in note for note in model.notes):
         return ScanError(

@@ -4,7 +4,7 @@ A file may be larger than memory. :func:`scan_chunks` gives a scan in pieces, an
 near some places says so by ``ReadOptions.boxes``. A format takes part by ``chunks`` beside ``read``::
 
     def las_chunks(path: Path, options: ReadOptions) -> Iterator[PointCloud]: ...
-    Format("COPC", (), read_las, looks=looks_like_copc, chunks=copc_chunks),
+    Format("COPC", (), read_las, looks=looks_like_copc, chunks=copc_chunks, states=las_unit),
     Format("LAS", (".las", ".laz"), read_las, write_las, (b"LASF",), chunks=las_chunks)
 
 - It yields ``PointCloud`` (or ``LineScan``) pieces in the file's order and unit, float64, of about a million
@@ -40,6 +40,7 @@ from bimfit.scan.formats.delimited import read_csv, write_csv
 from bimfit.scan.formats.e57 import e57_chunks, read_e57
 from bimfit.scan.formats.hokuyo_logs import looks_like_breezy, looks_like_ubh, read_breezy, read_ubh
 from bimfit.scan.formats.las import las_chunks, read_las, write_las
+from bimfit.scan.formats.las_crs import las_unit
 from bimfit.scan.formats.npz import read_npz, write_npz
 from bimfit.scan.formats.options import ANY, ReadOptions, unit_name
 from bimfit.scan.formats.packing import GZIP, unpacked
@@ -81,6 +82,8 @@ class Format:
         Whether the reader itself turns all lengths into metres (pictures, whose pixels have sizes).
     chunks : callable or None
         (path, options) -> pieces of the scan; None where the file is only read whole.
+    states : callable or None
+        Metres a unit of length that a file itself states, None where it does not; None where no file does.
     """
 
     name: str
@@ -93,6 +96,7 @@ class Format:
     unit: float = 1.0
     sized: bool = False
     chunks: Callable[[Path, ReadOptions], Iterator[Scan]] | None = None
+    states: Callable[[Path], float | None] | None = None
 
 
 def _plain(read: Callable[[Path], Scan]) -> Callable[[Path, ReadOptions], Scan]:
@@ -112,8 +116,8 @@ FORMATS: tuple[Format, ...] = (
         (b"# .PCD", b"VERSION 0.7", b"VERSION .7"),
         chunks=pcd_chunks,
     ),
-    Format("COPC", (), read_las, looks=looks_like_copc, chunks=copc_chunks),
-    Format("LAS", (".las", ".laz"), read_las, write_las, (b"LASF",), chunks=las_chunks),
+    Format("COPC", (), read_las, looks=looks_like_copc, chunks=copc_chunks, states=las_unit),
+    Format("LAS", (".las", ".laz"), read_las, write_las, (b"LASF",), chunks=las_chunks, states=las_unit),
     Format("E57", (".e57",), read_e57, None, (b"ASTM-E57",), chunks=e57_chunks),
     Format(
         "ROS bag",
@@ -164,9 +168,10 @@ def read_scan(path: str | Path, unit: float | None = None, options: ReadOptions 
     if unit is not None:
         options = replace(options, unit=unit)
     with _opened(Path(path)) as (form, inner):
+        options, why = _with_stated_unit(form, inner, options, Path(path))
         scan = _in_metres(form.read(inner, options), form, options, Path(path))
     said = summary(scan, form.name, options.unit or form.unit)
-    return replace(scan, notes=(*scan.notes, said))
+    return replace(scan, notes=(*scan.notes, *why, said))
 
 
 def scan_chunks(path: str | Path, options: ReadOptions = ANY) -> Iterator[Scan]:
@@ -187,10 +192,32 @@ def scan_chunks(path: str | Path, options: ReadOptions = ANY) -> Iterator[Scan]:
     """
     with _opened(Path(path)) as (form, inner):
         read = form.chunks or (lambda path, options: iter((form.read(path, options),)))
+        options, why = _with_stated_unit(form, inner, options, Path(path))
         said = f"{form.name}, in {unit_name(options.unit or form.unit)}"
         for piece in read(inner, options):
             scan = _in_metres(piece, form, options, Path(path))
-            yield replace(scan, notes=(*scan.notes, said))
+            yield replace(scan, notes=(*scan.notes, *why, said))
+
+
+def unit_taken(path: str | Path, options: ReadOptions = ANY) -> float:
+    """Metres a unit of length that reading a scan takes: the one said, stated by the file, or usual."""
+    with _opened(Path(path)) as (form, inner):
+        return _with_stated_unit(form, inner, options, Path(path))[0].unit or form.unit
+
+
+def _with_stated_unit(
+    form: Format, inner: Path, options: ReadOptions, source: Path
+) -> tuple[ReadOptions, tuple[str, ...]]:
+    """The options with the unit that the file states, where the user says none, and a note of it."""
+    if options.unit is not None or form.states is None:
+        return options, ()
+    try:
+        unit = form.states(inner)
+    except ScanError as error:
+        raise ScanError(error.message, file=source, place=error.place, remedy=error.remedy) from error
+    if unit is None or unit == form.unit:
+        return options, ()
+    return replace(options, unit=unit), (f"its coordinate system is in {unit_name(unit)}",)
 
 
 @contextmanager
