@@ -197,7 +197,7 @@ def find_knots(
             knots[j] = knots[j - 1]
         knots[where] = pick
         count += 1
-        allowed[max(pick - 1, 0) : pick + 2] = False
+        allowed[pick] = False
         cost = _messages(s, sums, knots, count, left, right, work)
     for _ in range(2):
         for j in range(1, count - 1):

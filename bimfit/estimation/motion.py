@@ -13,6 +13,7 @@ from bimfit.errors import ConfigError
 from bimfit.estimation import _kernels_knots as kernels
 from bimfit.estimation import trend
 from bimfit.estimation.borrow import FLAG, SHAKES, at_corner, borrow
+from bimfit.estimation.disagreement import disagreements
 from bimfit.estimation.result import ComponentEstimate, StationEstimate
 from bimfit.estimation.trend import Basis, Sites, Trend
 from bimfit.geometry.joint_section import JointSection
@@ -23,6 +24,8 @@ Motion = Literal["independent", "const", "rigid", "linear", "smooth", "kinked", 
 _KEEP_KNOT = 30.0
 _KINKED_MARGIN = 20.0
 _FEW = 3
+_BOTH = 0.5
+"""Stations that count for less than that, both components of them, have moved and are no outliers."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +127,7 @@ def estimate_joint(
     for name in ("const", "rigid", "linear", "smooth", "kinked") if model == "auto" else (model,):
         if name == "kinked":
             screen = fits.get("smooth") or _fit_pair(parts, _bases("smooth", parts, knots))
-            knots = _find_knots(parts, [t.weight for t in screen])
+            knots = _find_knots(parts, _weights(screen))
         bases[name] = _bases(name, parts, knots)
         pair = fits[name] = _fit_pair(parts, bases[name])
         # the smooth model's two hyper-parameters a component are fitted too
@@ -137,12 +140,13 @@ def estimate_joint(
     fitted = tuple(
         trend.with_shared_cells(p, b, t) for p, b, t in zip(parts, bases[chosen], fits[chosen], strict=True)
     )
-    out, outliers = _apply(stations, sections, parts, (fitted[0], fitted[1]))
+    bent = knots if chosen == "kinked" else np.zeros(0)
+    apart = disagreements(stations, sections, parts, (fitted[0], fitted[1]), bent)
+    out, outliers = _apply(stations, sections, parts, apart)
     couplings = tuple(
         Coupling(b, t.spread, np.array([section.gap.mouth[which] for section in sections]))
         for which, (b, t) in enumerate(zip(bases[chosen], fitted, strict=True))
     )
-    bent = knots if chosen == "kinked" else np.zeros(0)
     return JointEstimate(out, chosen, criterion, bent, outliers, (couplings[0], couplings[1]))
 
 
@@ -231,6 +235,16 @@ def _sites(estimates: tuple[StationEstimate, ...], sections: Sequence[JointSecti
 
 def _motion_of(pose: Pose2D, corner: Array) -> Array:
     return np.array([*(pose.apply(corner) - corner), pose.theta])
+
+
+def _weights(screen: tuple[Trend, Trend]) -> tuple[Array, Array]:
+    """What each station counts for where knots are looked for: in full where both components disagree.
+
+    Then the joint has jumped, and more knots are what explains it.
+    """
+    a, b = (t.weight for t in screen)
+    jumps = np.maximum(a, b) < _BOTH
+    return np.where(jumps, 1.0, a), np.where(jumps, 1.0, b)
 
 
 def _find_knots(parts: tuple[Sites, Sites], weights: Sequence[Array]) -> Array:

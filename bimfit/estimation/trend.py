@@ -220,19 +220,23 @@ def fit(sites: Sites, basis: Basis, *, rounds: int = 4) -> Trend:
     return Trend(value, V, weight, distance, jump, deviance, freedom, cov)
 
 
-def _left_out(sites: Sites, weight: Array, value: Array, V: Array) -> tuple[Array, Array]:
-    """Squared Mahalanobis distance of every station from the fit to the others; how likely it has jumped.
-
-    The latter is the posterior probability of a residual N(0, S + J) against N(0, S), J that of a jump.
-    """
+def left_out(sites: Sites, weight: Array, value: Array, V: Array) -> tuple[Array, Array]:
+    """Every station less the fit to the others (n, 3), and the covariance of that (n, 3, 3)."""
     # regularised, for a station may say nothing about one direction
     C = np.linalg.inv(sites.precision + np.diag([400.0, 400.0, 4.0]))
     W = C / np.maximum(weight, 1e-3)[:, None, None]
     # the fit without a station: its residual grows, and the fit's own covariance does too
     gain = V @ np.linalg.inv(W - V + 1e-15 * np.eye(3))
     e = sites.value - value
-    e = e + np.einsum("iab,ib->ia", gain, e)
-    spread = C + V + gain @ V
+    return e + np.einsum("iab,ib->ia", gain, e), C + V + gain @ V
+
+
+def _left_out(sites: Sites, weight: Array, value: Array, V: Array) -> tuple[Array, Array]:
+    """Squared Mahalanobis distance of every station from the fit to the others; how likely it has jumped.
+
+    The latter is the posterior probability of a residual N(0, S + J) against N(0, S), J that of a jump.
+    """
+    e, spread = left_out(sites, weight, value, V)
     near = np.einsum("ia,ia->i", e, np.linalg.solve(spread, e[:, :, None])[:, :, 0])
     wide = spread + np.diag(_JUMP**2)
     far = np.einsum("ia,ia->i", e, np.linalg.solve(wide, e[:, :, None])[:, :, 0])
