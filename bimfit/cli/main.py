@@ -27,6 +27,7 @@ from bimfit.cli import (
     view,
 )
 from bimfit.errors import BimfitError
+from bimfit.sensor.exits import termination_raises
 
 CACHE_OFF = "BIMFIT_NO_CACHE"
 DONE, PARTLY, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -87,21 +88,35 @@ def main(argv: Sequence[str] | None = None) -> int:
     no_cache = "--no-cache" in words
     words = [word for word in words if word not in ("--debug", "--no-cache")]
     try:
-        with _without_cache() if no_cache else contextlib.nullcontext():
+        with termination_raises(), _without_cache() if no_cache else contextlib.nullcontext():
             status = app(words, prog_name="bimfit", standalone_mode=False)
+            if sys.stdout is not None:
+                sys.stdout.flush()  # a full disk is found out here, not on the way out
     except BimfitError as error:
         return _refuse(str(error), debug)
     except KeyboardInterrupt:
         return _refuse("interrupted", debug=False, status=INTERRUPTED)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _write_no_more()
         return DONE
+    except OSError as error:
+        _write_no_more()
+        what = f"{error.filename}: cannot be used" if error.filename else "the output cannot be written"
+        return _refuse(f"{what}: {error.strerror or error}", debug)
     except Exception as error:
         if hasattr(error, "format_message"):  # a usage error of typer's
             return _refuse(f"{error.format_message()} Try: bimfit --help", debug)
         line = f"internal error ({type(error).__name__}: {error}); please report it with what --debug shows"
         return _refuse(line, debug)
+    if status == INTERRUPTED:  # typer takes Ctrl-C for itself
+        return _refuse("interrupted", debug=False, status=INTERRUPTED)
     return status if isinstance(status, int) else DONE
+
+
+def _write_no_more() -> None:
+    """Let Python's own flush at the end go nowhere."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @contextlib.contextmanager

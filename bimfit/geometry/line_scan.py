@@ -98,14 +98,18 @@ class LineScan:
         """Every sweep as a scan of its own, in the order of their numbers."""
         order = np.argsort(self.scan, kind="stable")
         for rows in np.split(order, np.flatnonzero(np.diff(self.scan[order])) + 1) if len(order) else ():
-            yield replace(
-                self,
-                scan=self.scan[rows],
-                origins=self.origins[rows],
-                directions=self.directions[rows],
-                ranges=self.ranges[rows],
-                extra={name: column[rows] for name, column in self.extra.items()},
-            )
+            yield self.taken(rows)
+
+    def taken(self, rows: Ids) -> LineScan:
+        """Some of the beams, by their places (k,)."""
+        return replace(
+            self,
+            scan=self.scan[rows],
+            origins=self.origins[rows],
+            directions=self.directions[rows],
+            ranges=self.ranges[rows],
+            extra={name: column[rows] for name, column in self.extra.items()},
+        )
 
     def transformed(self, T: ArrayLike) -> LineScan:
         """The scan moved by a rigid 4 x 4 matrix, such as T_world_scanner."""
@@ -148,4 +152,23 @@ def joined(scans: Sequence[LineScan], source: str = "") -> LineScan:
         np.concatenate([s.ranges for s in scans]),
         source,
         tuple(dict.fromkeys(note for s in scans for note in s.notes)),
+    )
+
+
+def continued(pieces: Sequence[LineScan]) -> LineScan:
+    """Pieces of one line scan, at least one, whose sweeps are numbered for the whole of it."""
+    first = pieces[0]
+    extra = {
+        name: np.concatenate([piece.extra[name] for piece in pieces])
+        for name in first.extra
+        if all(name in piece.extra for piece in pieces)
+    }
+    return LineScan(
+        np.concatenate([piece.scan for piece in pieces]),
+        np.concatenate([piece.origins for piece in pieces]),
+        np.concatenate([piece.directions for piece in pieces]),
+        np.concatenate([piece.ranges for piece in pieces]),
+        first.source,
+        tuple(dict.fromkeys(note for piece in pieces for note in piece.notes)),
+        extra,
     )

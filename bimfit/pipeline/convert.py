@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +11,10 @@ from bimfit.errors import ScanError
 from bimfit.files import protect_inputs
 from bimfit.geometry.line_scan import LineScan
 from bimfit.geometry.pose import Array
+from bimfit.pipeline.scan_file import Scan, load_scan
 from bimfit.scan.cloud import PointCloud
-from bimfit.scan.formats import FORMATS, read_scan, write_scan
-from bimfit.scan.formats.options import ANY, ReadOptions, unit_name
-
-Scan = LineScan | PointCloud
+from bimfit.scan.formats import FORMATS, write_scan
+from bimfit.scan.formats.options import ANY, ReadOptions
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ def convert(source: Path, target: Path, options: ReadOptions = ANY, pose: Array 
         When the target cannot be written, is the source, or its extension names no format.
     """
     protect_inputs([target], [source])
-    scan = load_any(source, options)
+    scan = load_scan(source, options)
     notes = scan.notes
     if pose is not None:
         scan = scan.transformed(pose)
@@ -68,36 +67,6 @@ def convert(source: Path, target: Path, options: ReadOptions = ANY, pose: Array 
         notes = (*notes, lost)
     write_scan(scan, target)
     return Converted(scan, _said(scan), notes)
-
-
-def load_any(path: Path, options: ReadOptions = ANY) -> Scan:
-    """Read a scan file, or a recorded dialogue with a SCIP rangefinder.
-
-    Raises
-    ------
-    ScanError
-        When it is neither, or cannot be read.
-    """
-    known = {extension for form in FORMATS for extension in form.extensions}
-    if path.is_file() and path.suffix.lower() not in known:
-        scan = _dialogue(path)
-        if scan is not None:
-            return scan
-    return read_scan(path, options=options)
-
-
-def _dialogue(path: Path) -> LineScan | None:
-    """The sweeps of a SCIP dialogue; None where the file is none."""
-    from bimfit.sensor.dialogue import read_dialogue
-    from bimfit.sensor.sweep import line_scan
-
-    try:
-        sweeps = read_dialogue(path)
-    except ScanError:
-        return None
-    scan = line_scan(sweeps, source=str(path))
-    said = f"SCIP dialogue: {len(scan):,} beams in {len(sweeps):,} sweeps, stored in {unit_name(1e-3)}"
-    return replace(scan, notes=(*scan.notes, said))
 
 
 def _holds_beams(path: Path) -> bool:

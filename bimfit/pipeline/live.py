@@ -18,13 +18,12 @@ from bimfit.geometry.pose import Array
 from bimfit.geometry.status import Status
 from bimfit.pipeline.carriage import Mount, advanced, held_over
 from bimfit.pipeline.live_fit import NEAR, LiveFit, LiveStation
+from bimfit.pipeline.scan_file import load_scan
 from bimfit.pipeline.simulate import designed, longest_open
-from bimfit.pipeline.survey import load_scan, model_joints, mouth_paths, viewpoint_of
+from bimfit.pipeline.survey import model_joints, mouth_paths, viewpoint_of
 from bimfit.scan.coverage import covers
-from bimfit.scan.formats import Scan
 from bimfit.sensor.clock import host_clock
 from bimfit.sensor.counters import Counters
-from bimfit.sensor.dialogue import read_dialogue
 from bimfit.sensor.hokuyo import Hokuyo
 from bimfit.sensor.sweep import line_scan
 from bimfit.simulation.scenario import Scenario
@@ -81,7 +80,7 @@ class Live:
         ScanError
             When the file cannot be read, has no sweeps, or does not show the joint.
         """
-        scan = _recording(path)
+        scan = load_scan(path)
         if not isinstance(scan, LineScan):
             raise ScanError("a point cloud has no sweeps to replay", file=path, remedy="give a line scan")
         if not len(scan):
@@ -186,21 +185,6 @@ class Live:
         if mount.flip:
             joint = dataclasses.replace(joint, path=joint.path.flipped(), legs=joint.legs[::-1])
         return joint
-
-
-def _recording(path: Path) -> Scan:
-    """A scan, or the scans of a SCIP dialogue, whose device's clock serves where no other is recorded."""
-    try:
-        return load_scan(path)
-    except ScanError as no_scan:
-        try:
-            sweeps = read_dialogue(path)
-        except ScanError:
-            raise no_scan from None
-    timed = [
-        dataclasses.replace(s, stamp_host=s.stamp_device) if math.isnan(s.stamp_host) else s for s in sweeps
-    ]
-    return line_scan(timed, source=str(path))
 
 
 def _over_the_joint(ready: LiveFit, mount: Mount) -> Place:

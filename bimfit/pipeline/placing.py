@@ -15,6 +15,7 @@ from bimfit.errors import ScanError
 from bimfit.geometry.line_scan import LineScan
 from bimfit.geometry.path import JointPath
 from bimfit.geometry.pose import Array, rigid_inverse
+from bimfit.pipeline.scan_file import load_pieces
 from bimfit.pipeline.targets import match_reach
 from bimfit.scan.boxes import Boxes
 from bimfit.scan.cloud import PointCloud
@@ -200,11 +201,9 @@ def similarity_inverse(T: Array) -> Array:
 
 
 def _pieces(path: Path, placing: Placing, boxes: Boxes | None) -> Iterator[Scan]:
-    from bimfit.scan.formats import scan_chunks
-
     boxes = None if placing.trajectory is not None else boxes
     options = replace(placing.options, boxes=None if boxes is None else boxes.array)
-    for piece in read_ahead(scan_chunks(path, options)):
+    for piece in read_ahead(load_pieces(path, options)):
         if placing.trajectory is not None:
             yield _along(path, piece, placing.trajectory, placing.pose)
         else:

@@ -143,32 +143,37 @@ def shown_joints(
         placed = aligned(placed, model, chosen, config, placing.align)
         chosen = covered_joints(chosen, placed.nearby, config, asked=asked)
     if not chosen:
-        one = "the joint that was asked for" if asked else "enough of any joint"
-        raise ScanError(
-            f"the scan does not show {one}",
-            file=path,
-            remedy="check its units and its frame; --scan-pose places a scan that is in scanner coordinates",
-        )
+        raise shows_none(path, joints, placed, config, asked)
     return placed, chosen
+
+
+def shows_none(path: Path, joints: Sequence[Joint], placed: Placed, config: Config, asked: bool) -> ScanError:
+    """Why a scan that has returns near joints shows none of them, and what would help."""
+    shown = {joint.id: _cover(placed.nearby, joint, config) for joint in joints}
+    best = max(shown, key=lambda name: shown[name])
+    if not asked and shown[best] > 0.0:
+        return ScanError(
+            f"the scan shows no joint as a whole: most of joint {best}, of which it shows"
+            f" {100.0 * shown[best]:.0f} % ({100.0 * LEAST_COVER:.0f} % are wanted)",
+            file=path,
+            remedy=f"--joint {best} fits what there is of it; else check the scan's units and frame",
+        )
+    return ScanError(
+        f"the scan does not show {'the joint that was asked for' if asked else 'any joint'}",
+        file=path,
+        remedy="check its units and its frame; --scan-pose places a scan that is in scanner coordinates",
+    )
+
+
+def _cover(scan: Scan | Nearby, joint: Joint, config: Config, margin: float = 0.0) -> float:
+    """Share of a joint, 0 to 1, that the scan shows from the side from which it shows more."""
+    part = part_of(scan, joint, config, margin)
+    return max(covers(part, path, NEAR + margin) for path in mouth_paths(joint))
 
 
 def by_name(joints: Selection | Sequence[str]) -> bool:
     """Whether joints are asked for one by one."""
     return bool(joints) if isinstance(joints, Sequence) else joints.named
-
-
-def load_scan(path: Path, pose: Array | None = None) -> Scan:
-    """Read a scan and carry it into the model's coordinates.
-
-    Raises
-    ------
-    ScanError
-        When it cannot be read or shows nothing at all.
-    """
-    from bimfit.scan.formats import read_scan
-
-    scan = read_scan(path)
-    return scan if pose is None else scan.transformed(pose)
 
 
 def covered_joints(
@@ -179,12 +184,7 @@ def covered_joints(
     ``margin`` (m) is by how much the scan may still be off.
     """
     least = 0.0 if asked else LEAST_COVER
-    chosen = []
-    for joint in joints:
-        part = part_of(scan, joint, config, margin)
-        if max(covers(part, path, NEAR + margin) for path in mouth_paths(joint)) > least:
-            chosen.append(joint)
-    return chosen
+    return [joint for joint in joints if _cover(scan, joint, config, margin) > least]
 
 
 def part_of(scan: Scan | Nearby, joint: Joint, config: Config, margin: float = 0.0) -> Scan:

@@ -17,7 +17,7 @@ from bimfit.geometry.slice import Slice
 from bimfit.pipeline.fit import fit_station
 from bimfit.pipeline.placing import Placing, place_scan
 from bimfit.pipeline.profile_file import TaughtProfile
-from bimfit.pipeline.survey import by_name, covered_joints, cut_joint, model_joints, part_of
+from bimfit.pipeline.survey import by_name, covered_joints, cut_joint, model_joints, part_of, shows_none
 from bimfit.pipeline.targets import TargetCache, prepare
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def teach(
     placed = place_scan(scan_path, model, found, config, placing or Placing(None))
     chosen = covered_joints(found, placed.nearby, config, asked=by_name(joints))
     if not chosen:
-        raise ScanError("the scan does not show the joint", file=scan_path, remedy="name one with --joint")
+        raise shows_none(scan_path, found, placed, config, by_name(joints))
     if len(chosen) > 1:
         names = ", ".join(joint.id for joint in chosen[:6])
         raise JointError(

@@ -16,6 +16,7 @@ from bimfit.errors import BimfitError, ExportError
 from bimfit.files import whole_file
 from bimfit.geometry.mesh import TriangleMesh
 from bimfit.geometry.pose import Array
+from bimfit.report.signals import held_back
 from bimfit.report.style import GREY, INK, SCAN, SIDE_A, SIDE_B
 
 _PALE = ("#c9d8e8", "#ead6c2")
@@ -112,12 +113,13 @@ def render_joint(path: str | Path, scene: JointScene, view: View = _DEFAULT) -> 
     target = Path(path)
     if target.suffix.lower() != ".png":
         raise ExportError(f"no 3D picture format is called {target.suffix!r}", file=target, remedy="use .png")
-    plotter = _compose(scene, view, off_screen=True, path=target)
-    try:
-        with whole_file(target) as part:
-            plotter.screenshot(str(part))
-    finally:
-        plotter.close()
+    with held_back():  # a signal in the middle of VTK's work crashes the process
+        plotter = _compose(scene, view, off_screen=True, path=target)
+        try:
+            with whole_file(target) as part:
+                plotter.screenshot(str(part))
+        finally:
+            plotter.close()
     return target
 
 

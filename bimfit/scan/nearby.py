@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bimfit.geometry.line_scan import LineScan
+from bimfit.geometry.line_scan import LineScan, continued
 from bimfit.geometry.pose import Array
 from bimfit.scan.boxes import Boxes
 from bimfit.scan.cloud import PointCloud
@@ -24,6 +24,9 @@ Scan = LineScan | PointCloud
 
 MOST_POINTS = 16_000_000
 """More points than this near the places are thinned out: what bounds the memory."""
+MOST_BEAMS = 4_000_000
+"""Of line scans of more beams, only sweeps that pass near the places are kept."""
+_MOST_BOXES = 64
 _MIX = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9)
 _BOTTOM = 63
 
@@ -35,7 +38,7 @@ class Nearby:
     Attributes
     ----------
     scan : LineScan or PointCloud
-        A line scan is kept whole.
+        A line scan is kept whole, or where it is large without the sweeps that pass no place.
     boxes : Boxes
         The places.
     level : int
@@ -110,12 +113,16 @@ class Gatherer:
     boxes : Boxes
         The places, in world coordinates.
     most : int
+    most_beams : int
+        Of a line scan of more beams, sweeps none of whose beams passes through a place are left out.
     """
 
-    def __init__(self, boxes: Boxes, most: int = MOST_POINTS) -> None:
+    def __init__(self, boxes: Boxes, most: int = MOST_POINTS, most_beams: int = MOST_BEAMS) -> None:
         self.boxes = boxes
         self.most = most
-        self._level = self._count = 0
+        self.most_beams = most_beams
+        self._level = self._count = self._beams = 0
+        self._choosy = False
         self._points: list[Array] = []
         self._cells: list[NDArray[np.int32]] = []
         self._ranks: list[NDArray[np.uint8]] = []
@@ -136,7 +143,7 @@ class Gatherer:
         self._source = piece.source
         self._notes.update(dict.fromkeys(piece.notes))
         if isinstance(piece, LineScan):
-            self._lines.append(piece)
+            self._add_beams(piece)
             return
         index, cell = self.boxes.find(*piece.points.T)
         points = piece.points[index]
@@ -150,6 +157,17 @@ class Gatherer:
         while self._count > self.most and self._level < _BOTTOM:
             self._thin()
 
+    def _add_beams(self, piece: LineScan) -> None:
+        """Keep a piece whole, or once there are many beams only its sweeps that pass near a place."""
+        self._beams += len(piece)
+        if self._beams <= self.most_beams:
+            self._lines.append(piece)
+            return
+        if not self._choosy:
+            self._choosy = True
+            self._lines = [passing_sweeps(line, self.boxes) for line in self._lines]
+        self._lines.append(passing_sweeps(piece, self.boxes))
+
     def _thin(self) -> None:
         self._level += 1
         for k, ranks in enumerate(self._ranks):
@@ -162,7 +180,9 @@ class Gatherer:
         """All that was kept; nothing can be added afterwards."""
         notes = tuple(self._notes)
         if self._lines and not self._points:
-            scan = self._lines[0] if len(self._lines) == 1 else _continued(self._lines)
+            scan = self._lines[0] if len(self._lines) == 1 else continued(self._lines)
+            if self._choosy:
+                notes = (*notes, f"of {self._beams:,} beams, only sweeps that pass near the joints were kept")
             return Nearby(replace(scan, notes=notes), self.boxes)
         for line in self._lines:  # beams amid clouds count as what they hit
             self.add(PointCloud(line.hits, source=line.source))
@@ -185,23 +205,29 @@ class Gatherer:
         )
 
 
-def _continued(pieces: list[LineScan]) -> LineScan:
-    """Pieces of one line scan, its sweeps numbered for the whole file."""
-    first = pieces[0]
-    extra = {
-        name: np.concatenate([piece.extra[name] for piece in pieces])
-        for name in first.extra
-        if all(name in piece.extra for piece in pieces)
-    }
-    return LineScan(
-        np.concatenate([piece.scan for piece in pieces]),
-        np.concatenate([piece.origins for piece in pieces]),
-        np.concatenate([piece.directions for piece in pieces]),
-        np.concatenate([piece.ranges for piece in pieces]),
-        first.source,
-        first.notes,
-        extra,
-    )
+def passing_sweeps(scan: LineScan, boxes: Boxes) -> LineScan:
+    """The sweeps of which a beam passes through one of the boxes, whether or not anything came back."""
+    near = _pass(scan, boxes.bounds)
+    if len(boxes) <= _MOST_BOXES:
+        rows = np.flatnonzero(near)
+        some = scan.taken(rows)
+        near[rows] = np.any([_pass(some, box) for box in boxes.array], axis=0)
+    return scan.taken(np.flatnonzero(np.isin(scan.scan, np.unique(scan.scan[near]))))
+
+
+def _pass(scan: LineScan, box: Array) -> NDArray[np.bool_]:
+    """Which beams pass through a box (2, 3), shape (n,); one that nothing sent back goes on for ever."""
+    first, last = np.zeros(len(scan)), np.where(scan.returned, scan.ranges, np.inf)
+    for axis in range(3):
+        start, along = scan.origins[:, axis], scan.directions[:, axis]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            a, b = (box[0, axis] - start) / along, (box[1, axis] - start) / along
+        level = along == 0.0
+        inside = (start >= box[0, axis]) & (start <= box[1, axis])
+        a = np.where(level, np.where(inside, -np.inf, np.inf), a)
+        b = np.where(level, np.inf, b)
+        first, last = np.maximum(first, np.minimum(a, b)), np.minimum(last, np.maximum(a, b))
+    return np.asarray(first <= last)
 
 
 def _eyes(starts: list[int], eyes: list[Array | None]) -> tuple[tuple[int, Array | None], ...]:

@@ -48,6 +48,16 @@ def read_log(path: str | Path) -> list[tuple[float, bytes]]:
         data = Path(path).read_bytes()
     except OSError as error:
         raise ScanError(f"cannot be read: {error.strerror}", file=path) from error
+    return _records(data)
+
+
+def looks_like_dialogue(head: bytes) -> bool:
+    """Whether a file that starts so holds answers of a SCIP 2.0 device."""
+    said = b"".join(data for _, data in _records(head))
+    return b"\n00P\n" in said or b"\n99b\n" in said
+
+
+def _records(data: bytes) -> list[tuple[float, bytes]]:
     records: list[tuple[float, bytes]] = []
     at = 0
     while at < len(data):

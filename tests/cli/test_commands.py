@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import jsonschema
@@ -416,3 +419,42 @@ def test_paper_runs_the_method_as_printed(model, scan, tmp_path, capsys):
     assert main([*words[:3], "--paper", "--method", "mrcsm", "-o", str(tmp_path / "two")]) == 2
     assert "give one of them" in capsys.readouterr().err
     assert not (tmp_path / "two").exists()
+
+
+def test_a_scan_of_a_piece_of_a_joint_says_how_to_fit_it(model, scan, tmp_path, capsys):
+    rows = scan.read_text().splitlines()
+    first = [row for row in rows[1:] if float(row.split(",")[2]) < 0.12]
+    (tmp_path / "piece.csv").write_text("\n".join([rows[0], *first]) + "\n")
+    words = ["fit", model, tmp_path / "piece.csv", "-o", tmp_path / "o"]
+    refuse(words, capsys, "piece.csv", "as a whole", "--joint")
+    assert main([str(word) for word in [*words, "--joint", "hxkft", "--no-pictures", "--no-report"]]) == 0
+
+
+def test_a_recorded_dialogue_is_a_scan_for_fit_too(model, shared, tmp_path, capsys):
+    """It is read and placed; what it shows is a room, and no joint."""
+    file = shared / "scip" / "ug01_fw3.4.03_GD0044072501.reply"
+    words = [str(word) for word in ("fit", model, file, "-o", tmp_path / "o", "--scan-pose", "0,0,1,0,0,0")]
+    assert main(words) == 2
+    assert "unknown kind" not in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
+def test_a_full_disk_behind_standard_output_is_one_line(model):
+    with Path("/dev/full").open("w") as full:
+        words = [sys.executable, "-m", "bimfit", "joints", str(model)]
+        ended = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert ended.returncode == 2
+    assert ended.stderr == "bimfit: the output cannot be written: No space left on device\n"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_in_the_middle_leaves_nothing_behind(model, scan, tmp_path, number):
+    out = tmp_path / "o"
+    words = [sys.executable, "-m", "bimfit", "fit", str(model), str(scan), "-o", str(out), "--no-pictures"]
+    running = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    time.sleep(2.0)
+    running.send_signal(number)
+    said = running.communicate(timeout=60)[1]
+    assert "Traceback" not in said
+    assert not list(tmp_path.rglob(".*"))

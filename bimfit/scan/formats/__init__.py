@@ -36,12 +36,12 @@ from bimfit.scan.cloud import PointCloud
 from bimfit.scan.formats.bag import bag_chunks, is_bag_folder, read_bag
 from bimfit.scan.formats.carmen import looks_like_carmen, read_carmen
 from bimfit.scan.formats.copc import copc_chunks, looks_like_copc
-from bimfit.scan.formats.delimited import read_csv, write_csv
+from bimfit.scan.formats.delimited import csv_chunks, read_csv, write_csv
 from bimfit.scan.formats.e57 import e57_chunks, read_e57
 from bimfit.scan.formats.hokuyo_logs import looks_like_breezy, looks_like_ubh, read_breezy, read_ubh
 from bimfit.scan.formats.las import las_chunks, read_las, write_las
 from bimfit.scan.formats.las_crs import las_unit
-from bimfit.scan.formats.npz import read_npz, write_npz
+from bimfit.scan.formats.npz import npz_chunks, read_npz, write_npz
 from bimfit.scan.formats.options import ANY, ReadOptions, unit_name
 from bimfit.scan.formats.packing import GZIP, unpacked
 from bimfit.scan.formats.pcd import pcd_chunks, read_pcd, write_pcd
@@ -105,8 +105,8 @@ def _plain(read: Callable[[Path], Scan]) -> Callable[[Path, ReadOptions], Scan]:
 
 
 FORMATS: tuple[Format, ...] = (
-    Format("CSV", (".csv",), _plain(read_csv), write_csv, beams=True),
-    Format("NPZ", (".npz",), _plain(read_npz), write_npz, (b"PK\x03\x04",), beams=True),
+    Format("CSV", (".csv",), _plain(read_csv), write_csv, beams=True, chunks=csv_chunks),
+    Format("NPZ", (".npz",), _plain(read_npz), write_npz, (b"PK\x03\x04",), beams=True, chunks=npz_chunks),
     Format("PLY", (".ply",), _plain(read_ply), write_ply, (b"ply\n", b"ply\r\n"), chunks=ply_chunks),
     Format(
         "PCD",

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import zipfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +16,9 @@ from bimfit.errors import ScanError
 from bimfit.geometry.line_scan import LineScan
 from bimfit.scan.cloud import PointCloud, usable
 from bimfit.scan.formats.delimited import BEAM, check_beams
+from bimfit.scan.formats.options import ANY, ReadOptions
+
+_PIECE = 1_000_000
 
 
 def read_npz(path: Path) -> LineScan | PointCloud:
@@ -42,6 +50,58 @@ def read_npz(path: Path) -> LineScan | PointCloud:
     return check_beams(path, columns, extra, lambda row: f"row {row}")
 
 
+def npz_chunks(path: Path, options: ReadOptions = ANY) -> Iterator[LineScan | PointCloud]:
+    """Read a line scan in pieces; a cloud is one piece.
+
+    The pieces are read from all arrays side by side, and never more of them than a million beams.
+
+    Raises
+    ------
+    ScanError
+        As :func:`read_npz` does, at the latest after the last piece.
+    """
+    with _damage(path), ExitStack() as stack:
+        archive = stack.enter_context(zipfile.ZipFile(path))
+        names = {Path(name).stem: name for name in archive.namelist() if name.endswith(".npy")}
+        if not set(BEAM) <= names.keys():
+            yield read_npz(path)
+            return
+        arrays = {name: _Stored.open(stack.enter_context(archive.open(names[name]))) for name in names}
+        count = arrays["range"].count
+        own = {name: one for name, one in arrays.items() if one.count == count}
+        if count <= _PIECE or not set(BEAM) <= own.keys():
+            yield read_npz(path)
+            return
+        for start in range(0, count, _PIECE):
+            size = min(_PIECE, count - start)
+            read = {name: one.read(size) for name, one in own.items()}
+            columns = {name: _column(path, name, read.pop(name)) for name in BEAM}
+            yield check_beams(path, columns, read, lambda row, start=start: f"row {start + row}")
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """A one-dimensional array of numbers inside an archive, read from its front; ``count`` -1 for others."""
+
+    stream: IO[bytes]
+    count: int
+    dtype: np.dtype[np.generic]
+
+    @classmethod
+    def open(cls, stream: IO[bytes]) -> _Stored:
+        version = np.lib.format.read_magic(stream)
+        read = (
+            np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        )
+        shape, _, dtype = read(stream)
+        plain = len(shape) == 1 and dtype.kind in "fiub"
+        return cls(stream, int(shape[0]) if plain else -1, dtype)
+
+    def read(self, count: int) -> NDArray[np.generic]:
+        data = self.stream.read(count * self.dtype.itemsize)
+        return np.frombuffer(data, self.dtype, count)
+
+
 def write_npz(scan: LineScan | PointCloud, path: Path) -> None:
     """Write a scan as arrays, in full precision."""
     if isinstance(scan, PointCloud):
@@ -53,11 +113,17 @@ def write_npz(scan: LineScan | PointCloud, path: Path) -> None:
 
 
 def _arrays(path: Path) -> dict[str, NDArray[np.generic]]:
+    with _damage(path), path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise ScanError("not an .npz archive", file=path)
+        return {name: archive[name] for name in archive.files}
+
+
+@contextmanager
+def _damage(path: Path) -> Iterator[None]:
+    """Turn what damage makes NumPy, zip and zlib raise into one clear line."""
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise ScanError("not an .npz archive", file=path)
-            return {name: archive[name] for name in archive.files}
+        yield
     except ScanError:
         raise
     except OSError as error:

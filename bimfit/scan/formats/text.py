@@ -45,6 +45,8 @@ def read_table(
     wanted: Sequence[int],
     may_be_empty: Sequence[int] = (),
     rows: int | None = None,
+    *,
+    comma: bool = False,
 ) -> Array:
     """Read columns of numbers from delimited text.
 
@@ -63,6 +65,8 @@ def read_table(
         Of these, the columns whose empty cells are NaN; elsewhere an empty cell is an error.
     rows : int, optional
         How many lines to read at most; None reads to the end.
+    comma : bool
+        Whether decimals are set off by a comma, as spreadsheets in many countries write them.
 
     Returns
     -------
@@ -73,7 +77,7 @@ def read_table(
     ScanError
         Naming line and column of the first cell that is no number, or the first row of another length.
     """
-    parts = list(read_blocks(path, skip, delimiter, names, wanted, may_be_empty, rows))
+    parts = list(read_blocks(path, skip, delimiter, names, wanted, may_be_empty, rows, comma=comma))
     return np.concatenate(parts) if parts else np.zeros((0, len(wanted)))
 
 
@@ -85,14 +89,22 @@ def read_blocks(
     wanted: Sequence[int],
     may_be_empty: Sequence[int] = (),
     rows: int | None = None,
+    *,
+    comma: bool = False,
 ) -> Iterator[Array]:
     """The same as :func:`read_table`, some tens of megabytes of text at a time."""
+    for block, line in text_blocks(path, skip, rows):
+        yield parse_block(path, block, line, delimiter, names, wanted, may_be_empty, comma=comma)
+
+
+def text_blocks(path: Path, skip: int, rows: int | None = None) -> Iterator[tuple[bytes, int]]:
+    """Some tens of megabytes of whole lines at a time, and the number of the first of them in the file."""
     line = skip + 1
     with path.open("rb") as stream:
         for _ in range(skip):
             stream.readline()
         for block in _first(_whole_lines(stream), rows):
-            yield _parse(path, block, line, delimiter, names, list(wanted), set(may_be_empty))
+            yield block, line
             line += block.count(b"\n")
 
 
@@ -124,15 +136,26 @@ def _first(blocks: Iterator[bytes], lines: int | None) -> Iterator[bytes]:
         yield block
 
 
-def _parse(
+def parse_block(
     path: Path,
     block: bytes,
     line: int,
     delimiter: str,
     names: Sequence[str],
-    wanted: list[int],
-    empty: set[int],
+    wanted: Sequence[int],
+    may_be_empty: Sequence[int],
+    *,
+    comma: bool = False,
 ) -> Array:
+    """Columns of numbers of a block of lines, as :func:`read_table` reads them.
+
+    Raises
+    ------
+    ScanError
+        Naming line and column.
+    """
+    wanted, empty = list(wanted), set(may_be_empty)
+    block = block.replace(b",", b".") if comma else block
     quick = _quick(block, delimiter, len(names), wanted)
     if quick is not None:
         holes = np.asarray(np.isnan(quick).any(axis=0))

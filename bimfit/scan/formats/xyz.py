@@ -12,11 +12,13 @@ from bimfit.errors import ScanError
 from bimfit.geometry.line_scan import LineScan
 from bimfit.geometry.pose import Array
 from bimfit.scan.cloud import PointCloud, usable
-from bimfit.scan.formats.delimited import BEAM, read_csv
+from bimfit.scan.formats.delimited import BEAM, csv_chunks, read_csv
 from bimfit.scan.formats.options import ReadOptions
 from bimfit.scan.formats.text import first_lines, read_blocks
 
 _MOST_HEADER = 20
+_WAYS = ((";", False), (",", False), (" ", False), (";", True), (" ", True))
+"""Delimiters and whether a comma sets off decimals, the usual ones first."""
 
 
 def read_xyz(path: Path) -> LineScan | PointCloud:
@@ -41,7 +43,7 @@ def read_xyz(path: Path) -> LineScan | PointCloud:
 
 
 def xyz_chunks(path: Path, options: ReadOptions) -> Iterator[LineScan | PointCloud]:
-    """Read plain text points in pieces; a text file with the header of a line scan is one piece.
+    """Read plain text points in pieces.
 
     Raises
     ------
@@ -50,7 +52,7 @@ def xyz_chunks(path: Path, options: ReadOptions) -> Iterator[LineScan | PointClo
     """
     lines = _head(path)
     if _is_line_scan(lines):
-        yield read_csv(path)
+        yield from csv_chunks(path)
         return
     seen = 0
     for table in _pieces(path, lines):
@@ -69,9 +71,9 @@ def _head(path: Path) -> list[str]:
 
 
 def _pieces(path: Path, lines: list[str]) -> Iterator[Array]:
-    skip, delimiter, width = _layout(path, lines)
+    skip, delimiter, width, comma = _layout(path, lines)
     names = ["x", "y", "z", *(f"{k + 1}" for k in range(3, width))]
-    return read_blocks(path, skip, delimiter, names, range(width), range(width))
+    return read_blocks(path, skip, delimiter, names, range(width), range(width), comma=comma)
 
 
 def _cloud(path: Path, table: Array) -> PointCloud:
@@ -117,24 +119,30 @@ def _is_line_scan(lines: list[str]) -> bool:
     return set(BEAM[1:]) <= {word.strip().lower() for word in re.split(r"[,;\t]", lines[0])}
 
 
-def _layout(path: Path, lines: list[str]) -> tuple[int, str, int]:
-    """Lines before the first point, the delimiter, and how many numbers a row has."""
+def _layout(path: Path, lines: list[str]) -> tuple[int, str, int, bool]:
+    """Lines before the first point, delimiter, how many numbers a row has, and if commas set off decimals."""
     for number, line in enumerate(lines):
         if number > _MOST_HEADER:
             break
         if not line.strip() or line.lstrip().startswith(("#", "//", "%")):
             continue
-        delimiter = next((mark for mark in ";," if mark in line), " ")
-        words = line.split() if delimiter == " " else line.split(delimiter)
-        try:
-            values = [float(word) for word in words]
-        except ValueError:
-            continue
-        if len(values) >= 3:
-            return number, delimiter, len(values)
+        for delimiter, comma in _WAYS:
+            if delimiter == " " or delimiter in line:
+                width = _width(line, delimiter, comma)
+                if width >= 3:
+                    return number, delimiter, width, comma
     raise ScanError(
         "no row of at least three numbers", file=path, place=f"first {len(lines[:_MOST_HEADER])} lines"
     )
+
+
+def _width(line: str, delimiter: str, comma: bool) -> int:
+    """How many numbers a line has; 0 where one is none."""
+    words = line.split() if delimiter == " " else line.split(delimiter)
+    try:
+        return len([float(word.replace(",", ".") if comma else word) for word in words])
+    except ValueError:
+        return 0
 
 
 def _unit(vectors: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> bool:
