@@ -259,7 +259,8 @@ class SliceConfig:
     spacing : float or None
         Distance between stations, m; None takes it from the scan.
     thickness : float or None
-        How much of a point cloud along the joint makes a slice, m; None: the spacing.
+        How much of a scan along the joint makes a slice, m; None: the spacing, but where that is wider than
+        10 mm no more than this or than the scan's own sweeps or rows are apart.
     """
 
     spacing: float | None = None

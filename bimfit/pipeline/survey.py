@@ -26,7 +26,7 @@ from bimfit.pipeline.records import JointResult, SurveyResult
 from bimfit.pipeline.shown import share_shown
 from bimfit.pipeline.targets import match_reach, profile_reach, with_assumed_view, with_recovered_view
 from bimfit.scan.cloud import PointCloud
-from bimfit.scan.coverage import covers, scan_stations
+from bimfit.scan.coverage import covers, scan_stations, slice_thickness
 from bimfit.scan.nearby import Nearby
 from bimfit.scan.slicing import cut_slices
 
@@ -228,11 +228,12 @@ def cut_joint(
     sections = design_sections(elements, joint, stations, profile_reach(config)) if len(stations) else ()
     if not sections:
         return joint, (), ()
+    thickness = config.slices.thickness or slice_thickness(scan, mouth, config.slices.spacing)
     slices = cut_slices(
         scan,
         [section.frame for section in sections],
         [section.s for section in sections],
-        thickness=config.slices.thickness,
+        thickness=thickness,
         reach=match_reach(config),
     )
     if eye is None:

@@ -20,6 +20,8 @@ SLICE_POINTS = 40
 MOST_STATIONS = 1000
 NEAREST_SLICES = 5e-3
 """Slices of a cloud are at least this far apart: in less, nothing that is built moves, m."""
+THIN = 0.01
+"""Stations farther apart get slices no thicker, if the scan allows: a joint moves along its way, m."""
 _CELL = 0.005
 _CELL_POINTS = 3
 _MOST_BEAMS = 500_000
@@ -88,6 +90,21 @@ def scan_stations(
     extent = max(float(high - low), 1e-9)
     stations = int(np.clip(count / SLICE_POINTS, 1, min(MOST_STATIONS, max(1.0, extent / NEAREST_SLICES))))
     return np.asarray(low + extent * (np.arange(stations) + 0.5) / stations)
+
+
+def slice_thickness(
+    scan: LineScan | PointCloud, path: JointPath, spacing: float | None, reach: float = 0.3
+) -> float | None:
+    """How thick slices are best made where stations have a given spacing, m; None leaves nothing out.
+
+    Components may move within a wide spacing. A slice is then no thicker than 10 mm, or than the stations
+    that the scan itself suggests are apart.
+    """
+    if spacing is None or spacing <= THIN:
+        return None
+    own = np.diff(scan_stations(scan, path, reach=reach))
+    usual = float(np.quantile(own, 0.9)) if len(own) else spacing
+    return min(spacing, max(THIN, usual * (1.0 + 1e-6)))
 
 
 def sweep_positions(scan: LineScan, grid: StationGrid, path: JointPath, reach: float) -> Array:

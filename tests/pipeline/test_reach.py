@@ -1,14 +1,20 @@
 """Walls that go on for longer than the scan is used: their cut ends must not hold the fit."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
-from worlds import boards, corner_errors, fans
 
-from bimfit.config import Config
+from bimfit.config import Config, SliceConfig
+from bimfit.geometry.line_scan import joined
 from bimfit.geometry.pose import Pose2D
 from bimfit.pipeline.fit import fit_joint
 from bimfit.pipeline.survey import cut_joint
 from bimfit.pipeline.targets import match_reach
+
+sys.path.insert(0, str(Path(__file__).parent))
+from worlds import boards, corner_errors, fans
 
 POSES = (Pose2D(0.004, 0.003, 0.012), Pose2D(0.006, 0.001, 0.015))
 
@@ -38,3 +44,21 @@ def test_walls_seen_aslant_are_measured(walls):
     assert sum(station.status.name == "ok" for station in result.stations) >= 10
     errors = corner_errors(result, POSES, ((-0.005, 0.0), (0.005, 0.0)))
     assert np.nanmax(errors) < 0.002
+
+
+def test_stations_wider_apart_than_sweeps_do_not_mix_what_moved_in_between():
+    """A component that runs off by 50 mm a metre: a slice of all sweeps of a cell would be smeared."""
+    model, joint, profiles = boards(0.02, 0.03, (0.2, 0.2), 0.6)
+    rng, ys = np.random.default_rng(2), np.arange(0.004, 0.6, 0.008)
+    bearings = np.radians(np.arange(-35, 35.1, 0.35))
+    scan = joined(
+        [
+            fans(profiles, (Pose2D(0.05 * (y - 0.3), 0.04 * (y - 0.3), 0.0), POSES[1]), [y], (0.0, 0.25),
+                 bearings, 0.002, rng)
+            for y in ys
+        ]
+    )  # fmt: skip
+    config = Config(slices=SliceConfig(spacing=0.1))
+    result = fit_joint(*cut_joint(model, joint, scan, config), config, threads=1)
+    assert sum(station.status.name == "ok" for station in result.stations) >= 5
+    assert all(station.slice.sweeps <= 2 for station in result.stations)
