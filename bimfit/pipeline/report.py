@@ -114,10 +114,11 @@ def _page(
     results: ResultsDocument, verdicts: list[Verdict], limits: Limits | None, joints: list[JointPage]
 ) -> Page:
     outcomes = [verdict.outcome for verdict in verdicts]
-    tiles = [Tile("joints", str(len(joints)))]
+    tiles = [_counted(len(joints), "joint", "joints")]
     if limits is not None and limits.given:
-        tiles += [Tile(f"joints {name}", str(outcomes.count(name))) for name in ("pass", "fail")]
-    tiles.append(Tile("joints not measured", str(outcomes.count("not measured"))))
+        tiles.append(_counted(outcomes.count("pass"), "joint passes", "joints pass"))
+        tiles.append(_counted(outcomes.count("fail"), "joint fails", "joints fail"))
+    tiles.append(_counted(outcomes.count("not measured"), "joint not measured", "joints not measured"))
     volumes = [joint.volume for joint in results.joints if math.isfinite(joint.volume)]
     if volumes:
         tiles.append(Tile("litre of sealant in all", f"{1e3 * sum(volumes):.3f}"))
@@ -164,6 +165,10 @@ def _joint_page(
         pictures=pictures,
         model=model,
     )
+
+
+def _counted(count: int, one: str, many: str) -> Tile:
+    return Tile(one if count == 1 else many, str(count))
 
 
 def _widths(joint: JointDocument) -> tuple[float, float, float, float]:

@@ -72,7 +72,7 @@ def test_it_needs_nothing_from_outside(page):
 def test_it_says_what_the_results_say(page):
     text = page.text
     for words in (
-        "As-built joints of model.ifc", "1 joints pass", "2 joints fail", "2 joints not measured",
+        "As-built joints of model.ifc", "1 joint passes", "2 joints fail", "2 joints not measured",
         "width at the mouth 12 to 30 mm, step between the faces ±3 mm", "a note",
         "Out of limits: width at the mouth 34.0 ± 0.4 mm at 1000 mm along the joint",
         "Not measured: no returns near the joint", "Not measured: the scan shows no station of it",
