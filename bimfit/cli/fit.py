@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,7 @@ from bimfit.errors import ConfigError
 if TYPE_CHECKING:
     from bimfit.bim.selection import Selection
     from bimfit.pipeline.placing import Placing
+    from bimfit.pipeline.records import SurveyResult
 
 
 @choosing
@@ -80,17 +82,13 @@ def run(
     bcf_version: str = typer.Option("2.1", "--bcf-version", metavar="V", help="2.1 or 3.0."),
 ) -> int:
     """Fit the joints of a model to a scan and write the as-built gap."""
-    from bimfit.pipeline.aligning import describe_alignment
     from bimfit.pipeline.deliver import Deliverables, check_deliverables, deliver
     from bimfit.pipeline.limits import Limits
-    from bimfit.pipeline.output import check_folder, describe
+    from bimfit.pipeline.output import check_folder
     from bimfit.pipeline.profile_file import read_profile
     from bimfit.pipeline.survey import survey
 
-    if paper:
-        if method not in ("grcsm", "paper"):
-            raise ConfigError(f"--paper and --method {method} are two methods", remedy="give one of them")
-        method = "paper"
+    matcher = _method(method, paper=paper)
     settings = build_config(
         config,
         window=window,
@@ -118,13 +116,27 @@ def run(
             scan,
             settings,
             joints=choice,
-            method=method,
+            method=matcher,
             motion=motion,
             placing=where,
             profile=None if profile is None else read_profile(profile),
             progress=progress,
         )
         _, said = deliver(result, output, wanted, progress)
+    return _tell(result, output, said)
+
+
+def _method(name: str, *, paper: bool) -> str:
+    if paper and name not in ("grcsm", "paper"):
+        raise ConfigError(f"--paper and --method {name} are two methods", remedy="give one of them")
+    return "paper" if paper else name
+
+
+def _tell(result: SurveyResult, output: Path, said: Sequence[str]) -> int:
+    """Print what came out, notes and failures on standard error; the exit status."""
+    from bimfit.pipeline.aligning import describe_alignment
+    from bimfit.pipeline.output import describe
+
     if result.placed is not None and result.placed.alignment is not None:
         print(describe_alignment(result.placed.alignment))
     for one in result.joints:
