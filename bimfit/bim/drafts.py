@@ -33,6 +33,7 @@ _SHARP = math.cos(math.radians(80.0))
 _FULL = 0.9
 _BAND_DEPTH = 0.5
 _ROUNDING = 1e-9
+_DRAWN = 1e-5  # files are drawn to about this, m
 _MID = 0.4871  # off the middle, where meshes tend to have vertices
 _SHARES = np.array([1.0 / 6.0, _MID, 5.0 / 6.0])
 
@@ -97,7 +98,7 @@ Key = tuple[int, int, str, int]
 
 
 def _strips(faces: Faces, frames: PairFrames, limits: Limits, least_gap: float) -> Strips:
-    pieces = facing_pieces(faces, frames, least_gap=least_gap, max_gap=limits.max_gap)
+    pieces = facing_pieces(faces, frames, least_gap=least_gap, max_gap=limits.max_gap + _DRAWN)
     strips = find_strips(frames, pieces)
     thin = (strips.depth < min(limits.min_depth, 0.002)) | (strips.length < limits.min_diagonal)
     return strips.take(np.flatnonzero(~thin & (strips.area >= 0.5 * limits.min_area)))

@@ -71,6 +71,17 @@ def test_found_at_any_orientation(angle):
     )
 
 
+def test_a_gap_as_wide_as_the_limit_is_found_whole():
+    """Placements are rounded where they are written: half of it must not fall outside."""
+    tilted = (
+        box((0.0, 0.0, 0.0), (0.2, 1.0, 0.1)),
+        prism([(0.26 + 1e-7, 0.0), (0.46, 0.0), (0.46, 0.1), (0.26 - 1e-7, 0.1)], 1.0),
+    )
+    (found,) = find_joints(model(*tilted))
+    assert found.length == pytest.approx(1.0)
+    assert found.depth == pytest.approx(0.1, rel=0.01)
+
+
 @pytest.mark.parametrize("gap", [0.0, 0.0005, -0.0008])
 def test_faces_that_touch(gap):
     joint = only(find_joints(model(*butt(gap))))
