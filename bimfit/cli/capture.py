@@ -39,7 +39,6 @@ def run(
     """Record a laser rangefinder (SCIP 2.0) until enough or until interrupted."""
     from bimfit.files import protect_inputs
     from bimfit.pipeline.capture import check_length, check_output, record
-    from bimfit.scan.formats import write_scan
 
     check_length(sweeps, seconds)
     way = 0.0 if speed is None else read_speed(speed)
@@ -56,6 +55,7 @@ def run(
 
             made = record(
                 port,
+                output,
                 sweeps=sweeps,
                 seconds=seconds,
                 field=half,
@@ -65,9 +65,9 @@ def run(
                 note=lambda text: print(f"bimfit: note: {text}", file=sys.stderr, flush=True),
             )
         with undisturbed():
-            write_scan(made.scan, output)
+            made.spool.finish()
     lost = f", {made.counters.missing} turns missing" if made.counters.missing else ""
-    print(f"{made.sweeps} sweeps, {len(made.scan)} beams{lost}: {output}")
+    print(f"{made.sweeps} sweeps, {made.spool.beams} beams{lost}: {output}")
     if made.failure is not None:
         print(f"bimfit: {made.failure}; the sweeps that came before are kept", file=sys.stderr)
         return 2

@@ -14,6 +14,7 @@ from bimfit.files import whole_file
 from bimfit.geometry.line_scan import LineScan
 from bimfit.geometry.pose import Array
 from bimfit.pipeline.carriage import advanced
+from bimfit.pipeline.spool import Spool
 from bimfit.scan.formats import FORMATS, write_scan
 from bimfit.sensor.counters import Counters
 from bimfit.sensor.hokuyo import Hokuyo
@@ -26,27 +27,26 @@ class Recording:
 
     Attributes
     ----------
-    scan : LineScan
-        With the columns ``time`` (s since 1970, of every beam), ``code`` (what the device sent), ``step``
-        and ``stamp`` (the device's clock at the sweep's start, s).
+    spool : Spool
+        Where it is, until :meth:`~bimfit.pipeline.spool.Spool.finish`; with the columns ``time`` (s since
+        1970, of every beam), ``code`` (what the device sent), ``step`` and ``stamp`` (the device's clock at
+        the sweep's start, s).
     sweeps : int
     counters : Counters
         What went wrong meanwhile.
-    interrupted : bool
-        Whether it ended by Ctrl-C or SIGTERM.
     failure : BimfitError or None
-        Why it ended before its time, where the device gave up.
+        Why it ended before its time, where the device gave up or the disc was full.
     """
 
-    scan: LineScan
+    spool: Spool
     sweeps: int
     counters: Counters
-    interrupted: bool = False
     failure: BimfitError | None = None
 
 
 def record(
     port: str | None,
+    output: Path,
     *,
     sweeps: int | None = None,
     seconds: float | None = None,
@@ -56,12 +56,14 @@ def record(
     told: Callable[[int], None] = lambda count: None,
     note: Callable[[str], None] = lambda text: None,
 ) -> Recording:
-    """Record sweeps; the laser is off afterwards, whatever happens.
+    """Record sweeps, each on disk as soon as it is whole; the laser is off afterwards, whatever happens.
 
     Parameters
     ----------
     port : str, optional
         None takes the one Hokuyo that is plugged in.
+    output : Path
+        The line scan that is to become of it.
     sweeps, seconds : optional
         When to end; whichever comes first, else never.
     field : float, optional
@@ -80,37 +82,39 @@ def record(
     SensorError
         When the device cannot be reached, or not one whole sweep came. Later failures end the recording.
     """
-    kept: list[Sweep] = []
-    interrupted, failure = False, None
+    count, first, failure = 0, (0.0, 0.0), None
+    spool = Spool(output)
     device = Hokuyo(port, guard=True, told=note)
     try:
         with device:
             start, end = (None, None) if field is None else device.parameters.steps(-field, field)
             with closing(device.scans(start, end, count=sweeps)) as stream:  # type: ignore[type-var]
                 for sweep in stream:
-                    kept.append(sweep)
-                    told(len(kept))
-                    if seconds is not None and sweep.stamp_host - kept[0].stamp_host >= seconds:
+                    if not count:
+                        first = sweep.stamp_host, float(sweep.times[np.argmin(np.abs(sweep.bearings))])
+                    spool.add(_laid_out(sweep, first[1], speed, pose))
+                    count += 1
+                    told(count)
+                    if seconds is not None and sweep.stamp_host - first[0] >= seconds:
                         break
     except KeyboardInterrupt:
-        interrupted = True
-    except SensorError as error:
-        if not kept:
+        pass
+    except (SensorError, ExportError) as error:
+        if not count:
             raise
         failure = error
-    if not kept:
+    finally:
+        spool.close()
+    if not count:
         raise SensorError("interrupted before the first whole sweep came; nothing is written")
-    return Recording(_laid_out(kept, speed, pose), len(kept), device.counters, interrupted, failure)
+    return Recording(spool, count, device.counters, failure)
 
 
-def _laid_out(kept: list[Sweep], speed: float, pose: Array | None) -> LineScan:
-    first = float(kept[0].times[np.argmin(np.abs(kept[0].bearings))])
+def _laid_out(sweep: Sweep, first: float, speed: float, pose: Array | None) -> LineScan:
+    """A sweep as beams, with its further columns; the sensor looked ahead first at that time, s."""
     at = np.eye(4) if pose is None else pose
-    scan = line_scan(kept, lambda times: advanced(at, speed * (times - first)), "rangefinder")
-    columns = {
-        "step": np.concatenate([sweep.steps for sweep in kept]),
-        "stamp": np.concatenate([np.full(sweep.steps.size, sweep.stamp_device) for sweep in kept]),
-    }
+    scan = line_scan([sweep], lambda times: advanced(at, speed * (times - first)), "rangefinder")
+    columns = {"step": sweep.steps, "stamp": np.full(sweep.steps.size, sweep.stamp_device)}
     return replace(scan, extra={**scan.extra, **columns})
 
 

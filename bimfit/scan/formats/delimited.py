@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,8 @@ from bimfit.scan.formats.options import ANY, ReadOptions
 from bimfit.scan.formats.text import first_lines, number_at, parse_block, read_blocks, text_blocks
 
 BEAM = ("scan", "ox", "oy", "oz", "dx", "dy", "dz", "range")
+UNFINISHED = ".part.csv"
+"""How the name of a table ends that is still being written; its last line may be torn."""
 _BLANK = b" \t\r\n,;"
 UNIT_SLACK = 1e-3
 """How far a direction's length may be from 1: four decimals are enough."""
@@ -93,7 +96,8 @@ def _beams(path: Path, layout: _Layout) -> Iterator[LineScan]:
     extras = _numeric_extras(path, layout, needed)
     blank = [layout.columns["range"]]
     row = 0
-    for block, line in text_blocks(path, layout.skip):
+    torn = path.name.endswith(UNFINISHED)
+    for block, line in text_blocks(path, layout.skip, torn=torn):
         if not block.strip(_BLANK):
             continue
         parse = partial(parse_block, path, block, line, layout.delimiter, layout.header, comma=layout.comma)
@@ -106,12 +110,14 @@ def _beams(path: Path, layout: _Layout) -> Iterator[LineScan]:
         first = row
         row += len(table)
         if len(table):
-            yield check_beams(
+            scan = check_beams(
                 path,
                 dict(zip(BEAM, table[:, : len(BEAM)].T, strict=True)),
                 {layout.header[k]: table[:, len(BEAM) + i].copy() for i, k in enumerate(extras)},
                 lambda k, first=first: f"line {number_at(path, first + k, layout.skip)}",
             )
+            said = "a recording that was not finished; its whole lines were read"
+            yield replace(scan, notes=(*scan.notes, said)) if torn else scan
     if not row:
         raise ScanError("the file holds no beam", file=path)
 
@@ -188,15 +194,31 @@ def write_csv(scan: LineScan | PointCloud, path: Path) -> None:
         if scan.intensity is not None:
             names, columns = [*names, "intensity"], [*columns, scan.intensity]
     else:
-        names = [*BEAM, *scan.extra]
-        columns = [scan.scan, *scan.origins.T, *scan.directions.T, scan.ranges, *scan.extra.values()]
+        names, columns = list(beam_names(scan)), _beam_columns(scan)
     with path.open("w", encoding="utf-8", newline="\n") as stream:
         stream.write(",".join(names) + "\n")
-        for start in range(0, len(columns[0]), 1 << 16):
-            cells = [
-                ["" if x != x else repr(x) for x in c[start : start + (1 << 16)].tolist()] for c in columns
-            ]
-            stream.writelines(",".join(row) + "\n" for row in zip(*cells, strict=True))
+        stream.writelines(_lines(columns))
+
+
+def beam_names(scan: LineScan) -> tuple[str, ...]:
+    """The columns of a line scan's table."""
+    return (*BEAM, *scan.extra)
+
+
+def beam_lines(scan: LineScan) -> Iterator[str]:
+    """The rows of a line scan's table, each with its line end."""
+    return _lines(_beam_columns(scan))
+
+
+def _beam_columns(scan: LineScan) -> list[NDArray[Any]]:
+    return [scan.scan, *scan.origins.T, *scan.directions.T, scan.ranges, *scan.extra.values()]
+
+
+def _lines(columns: Sequence[NDArray[Any]]) -> Iterator[str]:
+    for start in range(0, len(columns[0]), 1 << 16):
+        cells = [["" if x != x else repr(x) for x in c[start : start + (1 << 16)].tolist()] for c in columns]
+        for row in zip(*cells, strict=True):
+            yield ",".join(row) + "\n"
 
 
 def _layout(path: Path) -> _Layout:

@@ -97,18 +97,23 @@ def read_blocks(
         yield parse_block(path, block, line, delimiter, names, wanted, may_be_empty, comma=comma)
 
 
-def text_blocks(path: Path, skip: int, rows: int | None = None) -> Iterator[tuple[bytes, int]]:
-    """Some tens of megabytes of whole lines at a time, and the number of the first of them in the file."""
+def text_blocks(
+    path: Path, skip: int, rows: int | None = None, *, torn: bool = False
+) -> Iterator[tuple[bytes, int]]:
+    """Some tens of megabytes of whole lines at a time, and the number of the first of them in the file.
+
+    Where the file may be ``torn``, a last line without an end is left out.
+    """
     line = skip + 1
     with path.open("rb") as stream:
         for _ in range(skip):
             stream.readline()
-        for block in _first(_whole_lines(stream), rows):
+        for block in _first(_whole_lines(stream, torn), rows):
             yield block, line
             line += block.count(b"\n")
 
 
-def _whole_lines(stream: BinaryIO) -> Iterator[bytes]:
+def _whole_lines(stream: BinaryIO, torn: bool) -> Iterator[bytes]:
     rest = b""
     while block := stream.read(CHUNK):
         block = rest + block
@@ -116,7 +121,7 @@ def _whole_lines(stream: BinaryIO) -> Iterator[bytes]:
         rest = block[cut:]
         if cut:
             yield block[:cut].replace(b"\r\n", b"\n") if b"\r" in block else block[:cut]
-    if rest.strip():
+    if rest.strip() and not torn:
         yield rest.replace(b"\r", b"") + b"\n"
 
 
