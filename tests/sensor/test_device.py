@@ -203,3 +203,20 @@ def test_other_geometries():
     device = Device(lambda _: np.arange(1081), has, UG01, laser=True)
     scan = ReplyParser().feed(told(device, b"GD0000108001\n"))[0]
     assert scan.values.tolist() == list(range(1081))
+
+
+def test_a_turn_is_measured_once_whoever_asks_for_it():
+    """GD in the middle of a stream shows the ranges of the scan with the same stamp."""
+    rng = np.random.default_rng(4)
+    device = Device(lambda start: rng.integers(20, 5600, 682), Parameters())
+    device.receive(b"MD0384038401000\n", 0.0)
+    found = {}
+    for k in range(200):
+        now = 0.01 * k
+        if k == 80:
+            device.receive(b"GD0384038401\n", now)
+        for packet in device.take(now):
+            if packet.stamp is not None:
+                found.setdefault(packet.stamp, []).append(packet.data.split(b"\n")[3])
+    both = [ranges for ranges in found.values() if len(ranges) == 2]
+    assert len(both) == 1 and both[0][0] == both[0][1] and len(found) > 10

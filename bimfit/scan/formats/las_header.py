@@ -15,6 +15,8 @@ from bimfit.errors import ScanError
 _SHORTEST, _LONGEST = 227, 375
 _RECORD, _LONG_RECORD = 54, 60
 _PACKED = 0xC0
+_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1, 14: 0}
+"""Layers of each kind of item that is packed in layers; 0 for one a byte."""
 _ANY_SIZE = 0xFFFFFFFF
 _MOST_CHUNK = 50_000_000
 """Points a chunk; writers take 50,000."""
@@ -58,6 +60,34 @@ def _check(path: Path, stream: BinaryIO, head: bytes, size: int) -> None:
             raise ScanError(f"damaged: chunks of {chunk:,} points", file=path)
         if count > size:
             raise ScanError("damaged, or cut short: its chunk table has no room in it", file=path)
+        _check_layers(path, stream, packing, points, size)
+
+
+def _check_layers(path: Path, stream: BinaryIO, packing: bytes, points: int, size: int) -> None:
+    """Refuse chunks whose layers are larger than they: lazrs takes as much memory as a layer claims."""
+    (count,) = struct.unpack_from("<H", packing, 32)
+    items = [struct.unpack_from("<HHH", packing, 34 + 6 * k)[:2] for k in range(count)]
+    if not items or any(kind not in _LAYERS for kind, _ in items):
+        return  # packed the older way, without layers
+    try:
+        import lazrs
+    except ImportError:
+        return  # whoever reads the points says what is not installed
+    layers = sum(_LAYERS[kind] or length for kind, length in items)
+    first = sum(length for _, length in items)
+    stream.seek(points)
+    try:
+        table = lazrs.read_chunk_table(stream, lazrs.LazVlr(packing))
+    except Exception as error:  # lazrs has one of its own, and hands on those of the stream
+        raise ScanError(f"damaged: its chunk table cannot be read: {error}", file=path) from error
+    at = points + 8
+    for number, length in table:
+        stream.seek(at + first)
+        head = stream.read(4 * (1 + layers)) if number else b""
+        claimed = sum(struct.unpack_from(f"<{layers}I", head, 4)) if number else 0
+        at += length
+        if claimed > length or at > size:
+            raise ScanError("damaged: a chunk of points is larger than its room", file=path)
 
 
 def _packing(stream: BinaryIO, records: int) -> bytes | None:
