@@ -117,7 +117,7 @@ class ReplyParser:
         self._partial += data
         *lines, rest = bytes(self._partial).split(b"\n")
         events: list[Event] = []
-        for line in lines:
+        for line in (text.removesuffix(b"\r") for text in lines):  # as some converters end lines
             if line:
                 self._lines.append(line)
                 if len(line) > MAX_LINE or len(self._lines) > MAX_LINES:

@@ -59,6 +59,8 @@ _ANY_STATUS = {
     "0F": "too few parameters",
     "0G": "the string is longer than 16 characters",
     "0H": "the string has characters that are not allowed",
+    "0L": "the device is in no state to measure",
+    "10": "the laser is off",
     "0": "done (SCIP 1.1)",
     "E": "unknown request (SCIP 1.1)",
 }
