@@ -22,9 +22,11 @@ RUN = 512  # points whose sums are kept in single precision
 ROUNDING = (
     2.0**-14
 )  # such a sum's greatest error, as a share of its terms' magnitudes: RUN 2^-24, and to spare
+PART = 257  # weight whose sum of table values fits 16 bits
+HEAVY = 32  # weight from which on a block goes into the 32 bit sums at once
 
 # slots of the state vector
-HEAP, BEST, BEST_CODE, EVALUATIONS, PHASE, FOUND, BOUND = 0, 1, 2, 3, 4, 5, 6
+HEAP, BEST, BEST_CODE, EVALUATIONS, PHASE, FOUND, BOUND, DIVED = 0, 1, 2, 3, 4, 5, 6, 7
 EXPANDED = 8  # from here on, nodes expanded of each level; slot 8 counts rows of leaves scored
 STATE_SIZE = 32
 # what a call of ``search`` ends with
@@ -179,8 +181,9 @@ def merge_blocks(base, n, cu, cv, weight, own, classes, bu, bv, at, lists, count
 def bound_box(slot, n, lists, counts, blocks, place, level, v0, nv, u0, nu, tally):
     """Block bounds of nv x nu neighbouring nodes at one (level, angle) into rows of ``tally``.
 
-    ``place`` (levels, classes, 5): offset into ``blocks``, rows, columns, lowest block in u and v. Rows of
-    ``tally`` are nu + RIM long, those of ``blocks`` end in RIM zeros: both are gone through in whole vectors.
+    ``place`` (levels, classes, 6): offset into ``blocks``, rows, columns, lowest block in u and v, length of
+    a row. Rows of ``tally`` are nu + RIM long, those of ``blocks`` end in RIM zeros or more: both are gone
+    through in whole vectors.
     """
     stride = nu + RIM
     for k in range(nv * stride):
@@ -193,21 +196,71 @@ def bound_box(slot, n, lists, counts, blocks, place, level, v0, nv, u0, nu, tall
         y = np.int64(lists[1, m]) + v0 - place[level, c, 4]
         j0, j1 = max(0, -x), min(nu, columns - x)
         for i in range(max(0, -y), min(nv, rows - y)):
-            line, sums = place[level, c, 0] + (y + i) * (columns + RIM) + x + j0, i * stride + j0
+            line, sums = place[level, c, 0] + (y + i) * place[level, c, 5] + x + j0, i * stride + j0
             for k in range((j1 - j0 + RIM - 1) // RIM * RIM):
                 step = np.int32(weight * np.int32(blocks[np.uint64(line + k)]))
                 tally[np.uint64(sums + k)] = np.int32(tally[np.uint64(sums + k)] + step)
 
 
+@jit_inner
+def spill(part, stride, nv, nu, root, to):
+    """Add the sums of 16 bits to those of 32, and begin anew."""
+    for i in range(nv):
+        for k in range(nu):
+            root[np.uint64(to + i * nu + k)] += np.int32(part[np.uint64(i * stride + k)])
+    for k in range(nv * stride):
+        part[np.uint64(k)] = np.uint16(0)
+
+
+@jit_inner
+def bound_root(slot, n, lists, counts, blocks, place, level, nv, nu, part, root, to):
+    """Block bounds of all nodes at one angle of the first level, from ``to`` on in ``root``.
+
+    Rows of that level's blocks all have one length and end in at least nu zeros, and rows of ``part`` are as
+    long: a block's rows are gone through as one, in whole vectors of 16 bits; what lies beyond nu is waste.
+    """
+    stride = place[level, 0, 5]
+    for k in range(to, to + nv * nu):
+        root[np.uint64(k)] = np.int32(0)
+    for k in range(nv * stride):
+        part[np.uint64(k)] = np.uint16(0)
+    held = 0
+    for m in range(slot * n, slot * n + counts[slot]):
+        c, weight = lists[2, m], np.int64(lists[3, m])
+        rows, columns = place[level, c, 1], place[level, c, 2]
+        x = np.int64(lists[0, m]) - place[level, c, 3]
+        y = np.int64(lists[1, m]) - place[level, c, 4]
+        i0, i1 = max(0, -y), min(nv, rows - y)
+        if i0 >= i1 or x <= -nu or x >= columns:
+            continue
+        line = place[level, c, 0] + (y + i0) * stride + x
+        if weight > HEAVY:
+            for i in range(i1 - i0):
+                sums, own = to + (i0 + i) * nu, line + i * stride
+                for k in range(nu):
+                    step = np.int32(weight * np.int32(blocks[np.uint64(own + k)]))
+                    root[np.uint64(sums + k)] = np.int32(root[np.uint64(sums + k)] + step)
+            continue
+        if held + weight > PART:
+            spill(part, stride, nv, nu, root, to)
+            held = 0
+        held += weight
+        sums = i0 * stride
+        for k in range(((i1 - i0 - 1) * stride + nu + 2 * RIM - 1) // (2 * RIM) * (2 * RIM)):
+            step = np.uint16(weight * np.uint16(blocks[np.uint64(line + k)]))
+            part[np.uint64(sums + k)] = np.uint16(part[np.uint64(sums + k)] + step)
+    spill(part, stride, nv, nu, root, to)
+
+
 @jit
-def point_classes(n, pu, pv, qu, qv, eta, class_of, out):
-    """Slack class of every point on every level; ``eta`` (levels,) is half a node's angle.
+def point_classes(n, pu, pv, qu, qv, first, eta, class_of, out):
+    """Slack class of every point on the levels from ``first`` on; ``eta`` (levels,) is half a node's angle.
 
     A point at radius rho moves by at most 2 rho sin(min(eta, pi) / 2), so its cell by at most that
     many cells, rounded up. ``class_of`` (levels, slacks) maps cells of slack to a class.
     """
     last = class_of.shape[1] - 1
-    for level in range(eta.shape[0]):
+    for level in range(first, eta.shape[0]):
         arm = 2.0 * np.sin(0.5 * min(eta[level], np.pi)) / min(qu, qv)
         for k in range(n):
             move = arm * np.sqrt(pu[k] * pu[k] * qu * qu + pv[k] * pv[k] * qv * qv)
@@ -404,11 +457,11 @@ def log_prior(prior, prior_at, level, t, v, u):
 
 
 @jit_inner
-def block_bounds(
-    level, t, v0, nv, u0, nu, n, pu, pv, weight, start, cosine, sine, size, blocks, place, classes, slots, cu,
-    cv, have, lists, list_counts, at, tally,
+def list_blocks(
+    level, t, n, pu, pv, weight, start, cosine, sine, size, classes, slots, cu, cv, have, lists, list_counts,
+    at,
 ):  # fmt: skip
-    """Block bounds of nv x nu nodes of one level and angle into rows of ``tally``; keeps what it finds."""
+    """Make the blocks of one level and angle unless they are there; their slot."""
     middle = t * size[level, 2] + size[level, 2] // 2
     ensure_cells(middle, n, pu, pv, cosine, sine, start, cu, cv, have)
     slot = slots[level] + t
@@ -418,14 +471,14 @@ def block_bounds(
             list_counts,
             slot,
         )  # fmt: skip
-    bound_box(slot, n, lists, list_counts, blocks, place, level, v0, nv, u0, nu, tally)
+    return slot
 
 
 @jit
 def search(
     options, pu, pv, weight, heft, start, cosine, sine, size, count, lanes, blocks, place, quads, quad_place,
     quad_scale, class_of, classes, slots, prior, prior_at, cu, cv, have, lists, list_counts, near, near_have,
-    at, words, halves, coef, tally, box, root, keys, codes, found_codes, found_scores, state,
+    at, words, halves, coef, tally, part, box, root, crest, keys, codes, found_codes, found_scores, state,
 ):  # fmt: skip
     """Best-first branch and bound over (theta, v, u); resumable, see ``grcsm.py`` for the arguments."""
     n, first, top = options[0], options[1], options[2]
@@ -446,55 +499,63 @@ def search(
         # every node of the first level, then a greedy dive from the best of them
         best_root, best_at = -(np.int64(1) << 60), np.int64(0)
         for it in range(nt):
-            stride = nu
             if first == 0:
                 ensure_cells(it, n, pu, pv, cosine, sine, start, cu, cv, have)
                 score_box(it * n, n, cu, cv, weight, chunk, lanes, 0, nv, 0, nu, at, box, 0)
+                for k in range(nv * nu):
+                    root[it * nv * nu + k] = np.int32(box[k])
             else:
-                stride = nu + RIM
-                block_bounds(
-                    first, it, 0, nv, 0, nu, n, pu, pv, weight, start, cosine, sine, size, blocks, place,
-                    classes,
-                    slots, cu, cv, have, lists, list_counts, at, tally,
+                slot = list_blocks(
+                    first, it, n, pu, pv, weight, start, cosine, sine, size, classes, slots, cu, cv, have,
+                    lists, list_counts, at,
                 )  # fmt: skip
+                bound_root(
+                    slot, n, lists, list_counts, blocks, place, first, nv, nu, part, root, it * nv * nu
+                )
             for b in range(nv):
-                row, line = (it * nv + b) * nu, b * stride
+                line = (it * nv + b) * nu
                 most = -(np.int64(1) << 60)
                 if has_prior:
                     for c in range(nu):
-                        value = np.int64(tally[line + c]) if first > 0 else box[line + c]
-                        value += log_prior(prior, prior_at, first, it, b, c)
-                        root[row + c] = value
+                        value = root[line + c] + log_prior(prior, prior_at, first, it, b, c)
                         most = max(most, value)
-                elif first > 0:
-                    for c in range(nu):
-                        root[np.uint64(row + c)] = tally[np.uint64(line + c)]
-                        most = max(most, np.int64(tally[np.uint64(line + c)]))
                 else:
+                    greatest = np.int32(0)
                     for c in range(nu):
-                        root[np.uint64(row + c)] = box[np.uint64(line + c)]
-                        most = max(most, box[np.uint64(line + c)])
+                        greatest = max(greatest, root[np.uint64(line + c)])
+                    most = np.int64(greatest)
+                crest[it * nv + b] = most
                 if most > best_root:
-                    best_root, best_at = most, row
-                    while root[best_at] < most:
-                        best_at += 1
+                    best_root, best_at = most, line
+        if best_root > cut or first == 0:
+            # the first node of that bound
+            it, b = best_at // (nv * nu), best_at // nu % nv
+            for c in range(nu):
+                value = np.int64(root[best_at + c])
+                if has_prior:
+                    value += log_prior(prior, prior_at, first, it, b, c)
+                if value == best_root:
+                    best_at += c
+                    break
         evaluations += nt * nv * nu
         state[PHASE] = 1
         if first == 0:
             for i in range(nt * nv * nu):
-                code = pack(i // (nv * nu), (i // nu) % nv, i % nu)
+                code, value = pack(i // (nv * nu), (i // nu) % nv, i % nu), np.int64(root[i])
+                if has_prior:
+                    value += log_prior(prior, prior_at, 0, i // (nv * nu), (i // nu) % nv, i % nu)
                 if collect:
-                    if root[i] > cut:
+                    if value > cut:
                         if n_found < found_codes.shape[0]:
-                            found_codes[n_found], found_scores[n_found] = code, root[i]
+                            found_codes[n_found], found_scores[n_found] = code, value
                         n_found += 1
-                elif keeps(root[i], code, cut, cut_code):
-                    cut, cut_code = root[i], code
+                elif keeps(value, code, cut, cut_code):
+                    cut, cut_code = value, code
         elif best_root > cut:
             diving = True
             level, bound = first, best_root
             t, v, u = best_at // (nv * nu), (best_at // nu) % nv, best_at % nu
-            root[best_at] = -(np.int64(1) << 60)
+            state[DIVED] = best_at + 1
 
     stop = DONE
     while True:
@@ -505,18 +566,20 @@ def search(
                     if keys.shape[0] < n_heap + nt * nv * nu:
                         stop = HEAP_FULL
                         break
-                    for i in range(nt * nv * nu):
-                        value = root[i]
-                        if value < cut:
+                    for row in range(nt * nv):
+                        if crest[row] < cut:
                             continue
-                        code = pack(
-                            i // (nv * nu) * size[first, 2],
-                            (i // nu) % nv * size[first, 1],
-                            i % nu * size[first, 0],
-                        )
-                        if keeps(value, code, cut, cut_code):
-                            heap_push(keys, codes, n_heap, (value << 6) | (63 - first), code)
-                            n_heap += 1
+                        it, b = row // nv, row % nv
+                        for c in range(nu):
+                            value = np.int64(root[row * nu + c])
+                            if has_prior:
+                                value += log_prior(prior, prior_at, first, it, b, c)
+                            if value < cut or row * nu + c + 1 == state[DIVED]:
+                                continue
+                            code = pack(it * size[first, 2], b * size[first, 1], c * size[first, 0])
+                            if keeps(value, code, cut, cut_code):
+                                heap_push(keys, codes, n_heap, (value << 6) | (63 - first), code)
+                                n_heap += 1
                 state[PHASE] = 2
             if n_heap == 0:
                 break
@@ -579,11 +642,13 @@ def search(
         for a in range(ft):
             ct = t0 // lt + a
             if level > 1 and not majorant:
-                block_bounds(
-                    level - 1, ct, v0 // lv, fv, u0 // lu, fu, n, pu, pv, weight, start, cosine, sine, size,
-                    blocks,
-                    place, classes, slots, cu, cv, have, lists, list_counts, at, tally,
+                slot = list_blocks(
+                    level - 1, ct, n, pu, pv, weight, start, cosine, sine, size, classes, slots, cu, cv, have,
+                    lists, list_counts, at,
                 )  # fmt: skip
+                bound_box(
+                    slot, n, lists, list_counts, blocks, place, level - 1, v0 // lv, fv, u0 // lu, fu, tally
+                )
                 evaluations += fv * fu
             elif level == 1 and not majorant:
                 ensure_cells(ct, n, pu, pv, cosine, sine, start, cu, cv, have)
@@ -676,9 +741,8 @@ def match_run(
     half_angle,
     lanes, blocks, place, quads, quad_place, quad_scale, class_of, slots, prior, prior_at, pu, pv, weight,
     heft,
-    classes, cu, cv, have, lists, list_counts, near, near_have, at, words, halves, coef, tally, box, root,
-    keys,
-    codes, found_codes, found_scores, state, ints, reals,
+    classes, cu, cv, have, lists, list_counts, near, near_have, at, words, halves, coef, tally, part, box,
+    root, crest, keys, codes, found_codes, found_scores, state, ints, reals,
 ):  # fmt: skip
     """Match slices one after the other from ``begin`` on; the first that was not done.
 
@@ -721,7 +785,7 @@ def match_run(
         have[:] = 0
         near_have[:] = 0
         list_counts[:] = -1
-        point_classes(n, pu, pv, step[0], step[1], half_angle, class_of, classes)
+        point_classes(n, pu, pv, step[0], step[1], options[10], half_angle, class_of, classes)
         state[:] = 0
         state[BEST] = NOTHING
         if not np.isnan(hints[i, 0]):
@@ -737,7 +801,8 @@ def match_run(
             options, pu[:n], pv[:n], weight[:n], heft[:n], start, cosine, sine, size, count, lanes, blocks,
             place,
             quads, quad_place, quad_scale, class_of, classes, slots, prior, prior_at, cu, cv, have, lists,
-            list_counts, near, near_have, at, words, halves, coef, tally, box, root, keys, codes, found_codes,
+            list_counts, near, near_have, at, words, halves, coef, tally, part, box, root, crest, keys, codes,
+            found_codes,
             found_scores, state,
         )  # fmt: skip
         ints[i, HOW] = ended

@@ -9,7 +9,7 @@ from bimfit._kernels import jit, jit_fast, jit_inner_fast
 FULL = 255  # leaf value on the model itself
 LANE = 21  # bits of one of three sums that share a machine word
 MANY_TRIES = 12  # half a window up to which flatter quadratics are tried, too
-RIM = 16  # columns of zeros that end every row of a block table, so that rows are read in whole vectors
+RIM = 16  # columns of zeros, or more, that end every row of a block table, so that rows are read in whole vectors
 # bits of a quadratic's word: constant, two slopes, three curvatures
 BITS_A, BITS_G, BITS_H = 16, 12, 8
 MOST_A, MOST_G, MOST_H = (1 << BITS_A) - 1, (1 << (BITS_G - 1)) - 1, (1 << (BITS_H - 1)) - 1
@@ -61,13 +61,13 @@ def lane_table(leaf):
 
 
 @jit
-def block_table(leaf, bu, bv, slack, low_u, low_v, out):
+def block_table(leaf, bu, bv, slack, low_u, low_v, rim, out):
     """Overlapped block maxima: out[b] = max of leaf over b B - slack .. (b + 2) B - 2 + slack an axis.
 
-    RIM zeros end a row.
+    ``rim`` zeros end a row.
     """
     height, width = leaf.shape
-    rows, columns = out.shape[0], out.shape[1] - RIM
+    rows, columns = out.shape[0], out.shape[1] - rim
     part = np.zeros((height, columns), np.uint8)
     for i in range(height):
         for b in range(columns):

@@ -133,7 +133,9 @@ def _run(
     plan, work = grcsm.workspace(tables, longest + kernels.PAD)
     frame = np.array([*_frame(target, lattice), *_place(target, tables, config)])
     limit = config.max_evaluations if config.max_evaluations is not None else 1 << 60
-    options = np.array([0, plan.first, lattice.top, 0, limit, 1 << 60, 0, 0, has_prior, 0], np.int64)
+    options = np.array(
+        [0, plan.first, lattice.top, 0, limit, 1 << 60, 0, 0, has_prior, 0, plan.lowest], np.int64
+    )
     state = np.empty(kernels.STATE_SIZE, np.int64)
     reached: int = kernels.match_run(
         begin, points, ends, motions, weights, hints, frame, target.edges, options, _step(lattice),
@@ -141,7 +143,8 @@ def _run(
         tables.block_place, tables.quads, tables.quad_place, tables.quad_scale, tables.class_of, plan.slots,
         prior, prior_at, work.pu, work.pv, work.weight, work.heft, work.classes, work.cu, work.cv, work.have,
         work.lists, work.list_counts, work.near, work.near_have, work.at, work.words, work.halves, work.coef,
-        work.tally, work.box, work.root, work.keys, work.codes, work.found, work.values, state, ints, reals,
+        work.tally, work.part, work.box, work.root, work.crest, work.keys, work.codes, work.found, work.values,
+        state, ints, reals,
     )  # fmt: skip
     if reached < len(ends) and ints[reached, kernels.HOW] == kernels.HEAP_FULL:
         work.grow("keys", "codes")

@@ -24,8 +24,6 @@ MIN_POINTS = 3
 PAD = kernels.PAD
 WEIGHT_STEPS = 255  # unequal weights are rounded to this many steps of the greatest, or fewer
 MOST_WEIGHT = 300_000  # steps of all points together that the kernels' 32 bits hold
-NOMINAL = 160  # points that the first level is chosen for, so that it depends on the lattice alone
-ROOT_COST = 1_200_000.0  # look-ups that bounding the whole first level may cost
 TIME_SLICE = 2_000  # evaluations between two looks at the clock
 NOTHING = kernels.NOTHING
 _UNIT: NDArray[np.uint64] = np.zeros(0, np.uint64)  # stands for unit weights
@@ -189,6 +187,7 @@ class Plan:
     """What a search of up to ``capacity`` points on one set of tables needs to know, worked out once."""
 
     first: int
+    lowest: int
     roots: int
     fan: int
     slots: Integers
@@ -196,6 +195,7 @@ class Plan:
     slot_count: int
     near: int
     tally: int
+    part: int
     capacity: int
 
     @classmethod
@@ -204,16 +204,17 @@ class Plan:
         lattice = tables.lattice
         top, nodes, size = lattice.top, lattice.nodes, lattice.size
         quads = np.flatnonzero(tables.quad_place[:, 0] >= 0)
-        first = first_level(lattice, NOMINAL, int(quads.max(initial=1)))
+        first, place = tables.first, tables.block_place
+        lowest = min([first, *(h - 1 for h in range(2, first + 1) if h not in quads)])
         fan = max((int((size[h] // size[h - 1]).prod()) for h in range(1, top + 1)), default=1)
         ends = np.cumsum(nodes[:, 2])
-        rows, columns = int(nodes[first, 1]), int(nodes[first, 0]) + table_kernels.RIM
         split = [(size[h] // size[h - 1])[:2] for h in range(1, top + 1)]
-        tally = max([rows * columns, *(int(v) * (int(u) + table_kernels.RIM) for u, v in split)])
+        tally = max([1, *(int(v) * (int(u) + table_kernels.RIM) for u, v in split)])
+        part = int(nodes[first, 1] * place[first, 0, 5]) + 2 * table_kernels.RIM if place.ndim == 3 else 1
         slots = np.concatenate([[0], ends[:-1]]).astype(np.int64)
         return cls(
-            first, int(nodes[first].prod()), fan, slots, lattice.half_angle, int(ends[-1]),
-            int(nodes[quads, 2].sum()), tally, capacity,
+            first, lowest, int(nodes[first].prod()), fan, slots, lattice.half_angle, int(ends[-1]),
+            int(nodes[quads, 2].sum()), tally, part, capacity,
         )  # fmt: skip
 
 
@@ -237,7 +238,9 @@ class Workspace:
         self.coef = np.empty(5 * kernels.RUN, np.float32)
         self.box = np.empty(max(wide, plan.fan), np.int64)
         self.tally = np.empty(plan.tally, np.int32)
-        self.root = np.empty(plan.roots, np.int64)
+        self.part = np.empty(plan.part, np.uint16)
+        self.root = np.empty(plan.roots, np.int32)
+        self.crest = np.empty(int(lattice.nodes[plan.first, 1:].prod()), np.int64)
         self.keys = np.empty(plan.roots + (lattice.top + 2) * plan.fan + 1024, np.int64)
         self.codes = np.empty_like(self.keys)
         self.found = np.empty(max(1024, 2 * plan.fan), np.int64)
@@ -275,17 +278,6 @@ def workspace(tables: Tables, n: int) -> tuple[Plan, Workspace]:
     return held[1], held[2]
 
 
-def first_level(lattice: Lattice, n: int, lowest: int) -> int:
-    """The level that the search starts on: the finest whose nodes are all cheap to bound."""
-    best = lattice.top
-    for level in range(lattice.top, max(lowest, 1) - 1, -1):
-        nodes = lattice.nodes[level]
-        if float(nodes[2]) * n * min(12.0, float(nodes[1])) * (1.0 + nodes[0] / 8.0) > ROOT_COST:
-            break
-        best = level
-    return best
-
-
 @dataclass(frozen=True)
 class Outcome:
     """What a run of the kernel left."""
@@ -307,7 +299,7 @@ def run(
     plan, work = workspace(tables, n)
     prior, prior_at, has_prior = prior_table(config, lattice, problem.unit)
     kernels.point_classes(
-        n, problem.pu, problem.pv, lattice.step[0], lattice.step[1], plan.half_angle, tables.class_of,
+        n, problem.pu, problem.pv, lattice.step[0], lattice.step[1], plan.lowest, plan.half_angle, tables.class_of,
         work.classes,
     )  # fmt: skip
     state = np.zeros(kernels.STATE_SIZE, np.int64)
@@ -328,8 +320,8 @@ def run(
             lattice.size, lattice.nodes, tables.lanes, tables.blocks, tables.block_place, tables.quads,
             tables.quad_place, tables.quad_scale, tables.class_of, work.classes, plan.slots, prior, prior_at,
             work.cu, work.cv, work.have, work.lists, work.list_counts, work.near, work.near_have, work.at,
-            work.words, work.halves, work.coef, work.tally, work.box, work.root, work.keys, work.codes,
-            work.found, work.values, state,
+            work.words, work.halves, work.coef, work.tally, work.part, work.box, work.root, work.crest,
+            work.keys, work.codes, work.found, work.values, state,
         )  # fmt: skip
         if ended == kernels.HEAP_FULL:
             work.grow("keys", "codes")

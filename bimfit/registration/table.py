@@ -25,6 +25,8 @@ QUAD_SLACK = 6.0  # most slack by rotation in a level that has quadratics, in si
 QUAD_WINDOW = 3.0  # half a window beyond which a quadratic gains nothing over a plain maximum, in sigma
 QUAD_EXACT = 0.35  # half a window within which a quadratic is all but exact, in sigma
 GRAIN = 4.0  # half a block, in a record's cells; measured
+NOMINAL = 160  # points that the first level is chosen for, so that it depends on the lattice alone
+ROOT_COST = 1_200_000.0  # look-ups that bounding the whole first level may cost
 BLUR_REACH = math.sqrt(2.0 * math.log(2.0 * _kernels.FULL)) * 1.0001  # in sigma: farther, a cell holds 0
 
 
@@ -36,6 +38,8 @@ class Tables:
     ----------
     lattice : Lattice
     bound : {"majorant", "overlap", "block"}
+    first : int
+        The level that a search starts on: all its nodes are bounded.
     origin : ndarray, shape (2,)
         Outer corner of cell (0, 0), m, in the model's frame.
     leaf : ndarray of uint8, shape (rows, columns)
@@ -60,6 +64,7 @@ class Tables:
 
     lattice: Lattice
     bound: Bound
+    first: int
     origin: Array
     leaf: NDArray[np.uint8]
     lanes: NDArray[np.uint64]
@@ -121,17 +126,19 @@ def tables_of_leaf(
     """Bounds of every level over any leaf table; ``sigma``: blur in cells of the finer and coarser axis."""
     slacks = _slacks(lattice, min(lattice.step[:2]), reach)
     majorant = _majorant_levels(lattice, slacks, sigma[1]) if bound == "majorant" else ()
+    first = first_level(lattice, max(majorant, default=1))
     shared = _shared_level(lattice, slacks, majorant, sigma[0])
     slacks = [slacks[max(h, shared)] if h in majorant else own for h, own in enumerate(slacks)]
     class_of = _classes(slacks)
     if bound == "block":
         blocks, block_place = _printed_blocks(leaf, origin, lattice)
     else:
-        blocks, block_place = _overlapped_blocks(leaf, lattice, slacks, max(majorant, default=1))
+        wanted = {first} | {h - 1 for h in range(2, first + 1) if h not in majorant}
+        blocks, block_place = _overlapped_blocks(leaf, lattice, slacks, wanted, first)
     quads, quad_place, quad_scale = _quads(leaf, lattice, slacks, majorant, shared, sigma[0])
     angles = lattice.angles
     return Tables(
-        lattice, bound, origin, leaf, _kernels.lane_table(leaf), blocks, block_place, quads, quad_place,
+        lattice, bound, first, origin, leaf, _kernels.lane_table(leaf), blocks, block_place, quads, quad_place,
         quad_scale, class_of, reach, np.cos(angles), np.sin(angles), 0.0,
     )  # fmt: skip
 
@@ -195,25 +202,44 @@ def _shared_level(lattice: Lattice, slacks: list[Integers], levels: tuple[int, .
     return max(fine, default=0)
 
 
+def first_level(lattice: Lattice, lowest: int) -> int:
+    """The level that a search starts on: the finest whose nodes are all cheap to bound."""
+    best = lattice.top
+    for level in range(lattice.top, max(lowest, 1) - 1, -1):
+        nodes = lattice.nodes[level]
+        if float(nodes[2]) * NOMINAL * min(12.0, float(nodes[1])) * (1.0 + nodes[0] / 8.0) > ROOT_COST:
+            break
+        best = level
+    return best
+
+
 def _overlapped_blocks(
-    leaf: NDArray[np.uint8], lattice: Lattice, slacks: list[Integers], lowest: int
+    leaf: NDArray[np.uint8], lattice: Lattice, slacks: list[Integers], levels: set[int], first: int
 ) -> tuple[NDArray[np.uint8], Integers]:
+    """Block maxima of some levels; rows of the ``first`` end in zeros for all its nodes."""
     height, width = leaf.shape
-    place = np.zeros((lattice.top + 1, MAX_CLASSES, 5), np.int64)
-    parts: list[NDArray[np.uint8]] = []
-    offset = 0
-    for level in range(lowest, lattice.top + 1):
+    place = np.zeros((lattice.top + 1, MAX_CLASSES, 6), np.int64)
+    wide = int(lattice.nodes[first, 0])
+    parts: list[NDArray[np.uint8]] = [np.zeros(wide, np.uint8)]
+    offset = wide
+    for level in sorted(levels):
         bu, bv = int(lattice.size[level, 0]), int(lattice.size[level, 1])
+        most = int(slacks[level][-1])
         for c, slack in enumerate(slacks[level].tolist()):
             low_u, low_v = -((2 * bu - 2 + slack) // bu), -((2 * bv - 2 + slack) // bv)
             columns = (width - 1 + slack) // bu - low_u + 1
             rows = (height - 1 + slack) // bv - low_v + 1
-            out = np.zeros((rows, columns + _kernels.RIM), np.uint8)
-            _kernels.block_table(leaf, bu, bv, slack, low_u, low_v, out)
-            place[level, c] = offset, rows, columns, low_u, low_v
+            rim = _kernels.RIM
+            if level == first:  # all classes' rows are as long as those of the greatest slack
+                longest = (width - 1 + most) // bu + (2 * bu - 2 + most) // bu + 1
+                rim = longest - columns + max(wide, _kernels.RIM)
+            out = np.zeros((rows, columns + rim), np.uint8)
+            _kernels.block_table(leaf, bu, bv, slack, low_u, low_v, rim, out)
+            place[level, c] = offset, rows, columns, low_u, low_v, columns + rim
             parts.append(out.ravel())
             offset += out.size
-    return (np.concatenate(parts) if parts else np.zeros(1, np.uint8)), place
+    parts.append(np.zeros(wide + 2 * _kernels.RIM, np.uint8))
+    return np.concatenate(parts), place
 
 
 def _printed_blocks(

@@ -115,8 +115,8 @@ def test_no_block_holds_a_leaf_above_its_bound(seed_, shape, kind, weighted):
     tables, lattice, n = problem.tables, problem.tables.lattice, problem.n
     scores = naive_scores(problem)
     classes = np.empty((lattice.top + 1) * n, np.uint8)
-    kernels.point_classes(n, problem.pu, problem.pv, 1.0, 1.0, lattice.half_angle, tables.class_of, classes)
-    for level in range(1, lattice.top + 1):
+    kernels.point_classes(n, problem.pu, problem.pv, 1.0, 1.0, 1, lattice.half_angle, tables.class_of, classes)
+    for level in range(1, tables.first + 1):  # coarser ones are never asked for
         bu, bv, bt = (int(x) for x in lattice.size[level])
         nu, nv, nt = (int(x) for x in lattice.nodes[level])
         most = scores.reshape(nt, bt, nv, bv, nu, bu).max(axis=(1, 3, 5))
