@@ -313,7 +313,13 @@ def quad_pass(
     less_u, less_v = np.float32(1.0) / many_u, np.float32(1.0) / many_v
     mid_u, mid_v = np.float32((1 << where[level, 3]) >> 1), np.float32((1 << where[level, 4]) >> 1)
     unit_g, unit_h = np.float32(unit[level, 0]), np.float32(unit[level, 1])
-    for k in range(m):
+    shifted = where[level, 3] + where[level, 4] > 0  # otherwise a record serves one cell, its own
+    for k in range(0 if shifted else m):
+        x = min(max(np.int32(cu[np.uint64(base + k)] + shift_u), np.int32(0)), right)
+        y = min(max(np.int32(cv[np.uint64(base + k)] + shift_v), np.int32(0)), low)
+        own_table = np.int32(np.int32(classes[np.uint64(own + k)]) * stride)
+        at[k] = np.int32(np.int32(np.int32(y * width) + x) + own_table)
+    for k in range(m if shifted else 0):
         x = min(max(np.int32(cu[np.uint64(base + k)] + shift_u), np.int32(0)), right)
         y = min(max(np.int32(cv[np.uint64(base + k)] + shift_v), np.int32(0)), low)
         line = np.int32(np.int32(np.float32(y) * less_v) * width)
@@ -326,7 +332,27 @@ def quad_pass(
     two, zero_g, zero_h = np.float32(2.0), np.float32(2048.0), np.float32(128.0)
     t0, t1, t2 = np.float32(0.0), np.float32(0.0), np.float32(0.0)
     t3, t4, t5 = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-    for k in range(m):
+    for k in range(0 if shifted else m):
+        one, other = halves[2 * k], halves[2 * k + 1]
+        w = heft[np.uint64(k0 + k)]
+        wg, wh = w * unit_g, w * unit_h
+        gu = wg * (np.float32(np.int32(other & np.int32(0xFFF))) - zero_g)
+        gv = wg * (np.float32(np.int32(np.int32(other >> np.int32(12)) & np.int32(0xFFF))) - zero_g)
+        bu = wh * (np.float32(np.int32(np.int32(one >> np.int32(16)) & np.int32(0xFF))) - zero_h)
+        bv = wh * (np.float32(np.int32(np.int32(one >> np.int32(24)) & np.int32(0xFF))) - zero_h)
+        twist = wh * (np.float32(np.int32(np.int32(other >> np.int32(24)) & np.int32(0xFF))) - zero_h)
+        t0 += w * np.float32(np.int32(one & np.int32(0xFFFF)))
+        t1 += gu
+        t2 += gv
+        t3 += bu
+        t4 += twist
+        t5 += bv
+        coef[k] = gu
+        coef[RUN + k] = gv
+        coef[2 * RUN + k] = bu
+        coef[3 * RUN + k] = twist
+        coef[4 * RUN + k] = bv
+    for k in range(m if shifted else 0):
         x = np.float32(min(max(np.int32(cu[np.uint64(base + k)] + shift_u), np.int32(0)), right))
         y = np.float32(min(max(np.int32(cv[np.uint64(base + k)] + shift_v), np.int32(0)), low))
         ou = x - many_u * np.float32(np.int32(x * less_u)) - mid_u

@@ -9,7 +9,7 @@ from bimfit._kernels import jit, jit_fast, jit_inner_fast
 FULL = 255  # leaf value on the model itself
 LANE = 21  # bits of one of three sums that share a machine word
 MANY_TRIES = 12  # half a window up to which flatter quadratics are tried, too
-RIM = 16  # columns of zeros, or more, that end every row of a block table, so that rows are read in whole vectors
+RIM = 16  # columns of zeros, or more, that end a row of a block table: rows are read in whole vectors
 # bits of a quadratic's word: constant, two slopes, three curvatures
 BITS_A, BITS_G, BITS_H = 16, 12, 8
 MOST_A, MOST_G, MOST_H = (1 << BITS_A) - 1, (1 << (BITS_G - 1)) - 1, (1 << (BITS_H - 1)) - 1

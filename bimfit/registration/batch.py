@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -17,7 +16,7 @@ from bimfit.geometry.pose import Array, Pose2D
 from bimfit.registration import _kernels as kernels
 from bimfit.registration import grcsm
 from bimfit.registration.fitness import INLIER_SIGMAS
-from bimfit.registration.lattice import Integers, Lattice
+from bimfit.registration.lattice import Lattice
 from bimfit.registration.result import Stop
 from bimfit.registration.table import BLUR_REACH, Tables, Target
 
@@ -101,59 +100,40 @@ def _search(
 ) -> list[Found]:  # fmt: skip
     count, lattice = len(slices), grcsm.lattice_of(target, config, bound)
     points = slices[0] if count == 1 else np.concatenate(slices)
-    ends = np.array(list(itertools.accumulate(len(own) for own in slices)), np.int64)
+    ends = np.array(list(itertools.accumulate(map(len, slices))), np.int64)
     motions = np.array([_back(prior) for prior in priors])
-    hints = np.full((count, 3), np.nan)
+    hints = np.empty((count, 3))
+    hints.fill(np.nan)
     for i, pose in enumerate(incumbents or ()):
         if pose is not None:
             hints[i] = pose.u, pose.v, pose.theta
     ints, reals = np.zeros((count, 6), np.int64), np.zeros((count, 5))
-    longest = max(len(own) for own in slices)
+    longest = max(map(len, slices))
     begin = 0
     reach = 0.0 if target.has_tables(lattice, bound) else _reach(target, slices, motions, lattice)
     prior, prior_at, has_prior = grcsm.prior_table(config, lattice, unit)
+    limit = config.max_evaluations if config.max_evaluations is not None else 1 << 60
     while begin < count:
         tables = target.tables(lattice, bound, reach)
-        begin = _run(
-            target, tables, begin, longest, points, ends, motions, weights, hints, config, prior, prior_at,
-            has_prior, ints, reals,
+        plan, work = grcsm.workspace(tables, longest + kernels.PAD)
+        options = np.array(
+            [0, plan.first, lattice.top, 0, limit, 1 << 60, 0, 0, has_prior, 0, plan.lowest], np.int64
+        )
+        begin = kernels.match_run(
+            begin, points, ends, motions, weights, hints, _frame(target, tables, config), target.edges,
+            options, tables.step, tables.cosine, tables.sine, lattice.size, lattice.nodes, plan.half_angle,
+            *tables.arrays, plan.slots, prior, prior_at, *work.arrays, ints, reals,
         )  # fmt: skip
         if begin < count:
             reach = float(reals[begin, kernels.REACH])
+            if ints[begin, kernels.HOW] == kernels.HEAP_FULL:
+                work.grow("keys", "codes")
     return [_found(a, b, lattice) for a, b in zip(ints.tolist(), reals.tolist(), strict=True)]
-
-
-def _run(
-    target: Target, tables: Tables, begin: int, longest: int, points: Array, ends: Integers, motions: Array,
-    weights: NDArray[np.uint64], hints: Array, config: SearchConfig, prior: Integers, prior_at: Integers,
-    has_prior: bool, ints: Integers, reals: Array,
-) -> int:  # fmt: skip
-    """One compiled call: the first slice that was left undone, the queue already made longer for it."""
-    lattice = tables.lattice
-    plan, work = grcsm.workspace(tables, longest + kernels.PAD)
-    frame = np.array([*_frame(target, lattice), *_place(target, tables, config)])
-    limit = config.max_evaluations if config.max_evaluations is not None else 1 << 60
-    options = np.array(
-        [0, plan.first, lattice.top, 0, limit, 1 << 60, 0, 0, has_prior, 0, plan.lowest], np.int64
-    )
-    state = np.empty(kernels.STATE_SIZE, np.int64)
-    reached: int = kernels.match_run(
-        begin, points, ends, motions, weights, hints, frame, target.edges, options, _step(lattice),
-        tables.cosine, tables.sine, lattice.size, lattice.nodes, plan.half_angle, tables.lanes, tables.blocks,
-        tables.block_place, tables.quads, tables.quad_place, tables.quad_scale, tables.class_of, plan.slots,
-        prior, prior_at, work.pu, work.pv, work.weight, work.heft, work.classes, work.cu, work.cv, work.have,
-        work.lists, work.list_counts, work.near, work.near_have, work.at, work.words, work.halves, work.coef,
-        work.tally, work.part, work.box, work.root, work.crest, work.keys, work.codes, work.found, work.values,
-        state, ints, reals,
-    )  # fmt: skip
-    if reached < len(ends) and ints[reached, kernels.HOW] == kernels.HEAP_FULL:
-        work.grow("keys", "codes")
-    return reached
 
 
 def _reach(target: Target, slices: Sequence[Array], motions: Array, lattice: Lattice) -> float:
     """Largest distance from its pivot of any slice's point, m: what the first tables must provide for."""
-    frame, step, none = np.array(_frame(target, lattice)), _step(lattice), np.zeros(0, np.uint64)
+    frame, step, none = np.array(_near(target, lattice)), lattice.step, np.zeros(0, np.uint64)
     most = 0.0
     for points, motion in zip(slices, motions, strict=True):
         n = len(points)
@@ -167,12 +147,7 @@ def _reach(target: Target, slices: Sequence[Array], motions: Array, lattice: Lat
     return most
 
 
-@functools.lru_cache(maxsize=64)
-def _step(lattice: Lattice) -> Array:
-    return np.array(lattice.step)
-
-
-def _frame(target: Target, lattice: Lattice) -> tuple[float, ...]:
+def _near(target: Target, lattice: Lattice) -> tuple[float, ...]:
     """Box of what can be met, how far a window shifts a point and swings a unit of radius, least points."""
     margin = BLUR_REACH * target.blur + lattice.step[0] + lattice.step[1]
     low_u, low_v, high_u, high_v = target.box
@@ -184,13 +159,19 @@ def _frame(target: Target, lattice: Lattice) -> tuple[float, ...]:
     )  # fmt: skip
 
 
-def _place(target: Target, tables: Tables, config: SearchConfig) -> tuple[float, ...]:
-    """Reach of the tables, first motions u and v, the tables' corner, eps, inliers' gate, first angle."""
-    first, origin = tables.lattice.first, tables.origin
-    return (
-        tables.reach, first[0], first[1], float(origin[0]), float(origin[1]), config.eps,
-        INLIER_SIGMAS * target.blur, first[2],
-    )  # fmt: skip
+def _frame(target: Target, tables: Tables, config: SearchConfig) -> Array:
+    """After :func:`_near`: reach, first motions u and v, the tables' corner, eps, inliers, first angle."""
+    frame = tables.frames.get(config.eps)
+    if frame is None:
+        first, origin = tables.lattice.first, tables.origin
+        frame = np.array(
+            [
+                *_near(target, tables.lattice), tables.reach, first[0], first[1], float(origin[0]),
+                float(origin[1]), config.eps, INLIER_SIGMAS * target.blur, first[2],
+            ]
+        )  # fmt: skip
+        tables.frames[config.eps] = frame
+    return frame
 
 
 def _back(prior: Pose2D) -> tuple[float, float, float, float]:

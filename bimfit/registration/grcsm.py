@@ -7,6 +7,8 @@ import math
 import threading
 import time
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -246,6 +248,21 @@ class Workspace:
         self.found = np.empty(max(1024, 2 * plan.fan), np.int64)
         self.values = np.empty_like(self.found)
 
+    @cached_property
+    def scratch(self) -> tuple[NDArray[Any], ...]:
+        """What ``search`` scribbles on, in its order."""
+        return (
+            self.cu, self.cv, self.have, self.lists, self.list_counts, self.near, self.near_have, self.at,
+            self.words, self.halves, self.coef, self.tally, self.part, self.box, self.root, self.crest,
+            self.keys, self.codes, self.found, self.values,
+        )  # fmt: skip
+
+    @cached_property
+    def arrays(self) -> tuple[NDArray[Any], ...]:
+        """The same for ``match_run``, which prepares the points, too."""
+        state = np.empty(kernels.STATE_SIZE, np.int64)
+        return (self.pu, self.pv, self.weight, self.heft, self.classes, *self.scratch, state)
+
     def clear(self) -> None:
         """Forget the last slice."""
         self.flags[:] = 0
@@ -258,6 +275,8 @@ class Workspace:
             array = np.empty(2 * len(old), old.dtype)
             array[: len(old)] = old
             setattr(self, name, array)
+        self.__dict__.pop("scratch", None)
+        self.__dict__.pop("arrays", None)
 
 
 _LOCAL = threading.local()
@@ -274,7 +293,6 @@ def workspace(tables: Tables, n: int) -> tuple[Plan, Workspace]:
         plan = Plan.of(tables, -(-n // 64) * 64)
         held = tables, plan, Workspace(plan, tables.lattice)
         kept[id(tables)] = held
-    held[2].clear()
     return held[1], held[2]
 
 
@@ -297,10 +315,11 @@ def run(
     """Search, resuming after every look at the clock or growth of the queue."""
     tables, lattice, n = problem.tables, problem.tables.lattice, problem.n
     plan, work = workspace(tables, n)
+    work.clear()
     prior, prior_at, has_prior = prior_table(config, lattice, problem.unit)
     kernels.point_classes(
-        n, problem.pu, problem.pv, lattice.step[0], lattice.step[1], plan.lowest, plan.half_angle, tables.class_of,
-        work.classes,
+        n, problem.pu, problem.pv, lattice.step[0], lattice.step[1], plan.lowest, plan.half_angle,
+        tables.class_of, work.classes,
     )  # fmt: skip
     state = np.zeros(kernels.STATE_SIZE, np.int64)
     state[kernels.BEST], state[kernels.BEST_CODE] = NOTHING, 0
@@ -317,11 +336,8 @@ def run(
         ended = kernels.search(
             options, problem.pu, problem.pv, problem.weight, problem.heft, problem.start, tables.cosine,
             tables.sine,
-            lattice.size, lattice.nodes, tables.lanes, tables.blocks, tables.block_place, tables.quads,
-            tables.quad_place, tables.quad_scale, tables.class_of, work.classes, plan.slots, prior, prior_at,
-            work.cu, work.cv, work.have, work.lists, work.list_counts, work.near, work.near_have, work.at,
-            work.words, work.halves, work.coef, work.tally, work.part, work.box, work.root, work.crest,
-            work.keys, work.codes, work.found, work.values, state,
+            lattice.size, lattice.nodes, *tables.arrays, work.classes, plan.slots, prior, prior_at,
+            *work.scratch, state,
         )  # fmt: skip
         if ended == kernels.HEAP_FULL:
             work.grow("keys", "codes")

@@ -22,6 +22,7 @@ MAX_CELLS = 1 << 26
 MAX_CLASSES = 6  # slack classes (rings) a level
 QUAD_REACH = 3.2  # widest block that a quadratic serves, in sigma; measured
 QUAD_SLACK = 6.0  # most slack by rotation in a level that has quadratics, in sigma
+QUAD_LOOSE = 2.0  # slack from which on a finer first level, where it is cheap, is better; in sigma, measured
 QUAD_WINDOW = 3.0  # half a window beyond which a quadratic gains nothing over a plain maximum, in sigma
 QUAD_EXACT = 0.35  # half a window within which a quadratic is all but exact, in sigma
 GRAIN = 4.0  # half a block, in a record's cells; measured
@@ -60,6 +61,8 @@ class Tables:
         Of the lattice's angles.
     seconds : float
         What building took.
+    frames : dict
+        What ``batch.py`` keeps here, by eps.
     """
 
     lattice: Lattice
@@ -78,6 +81,20 @@ class Tables:
     cosine: Array
     sine: Array
     seconds: float
+    frames: dict[float, Array] = field(default_factory=dict, repr=False, compare=False)
+
+    @cached_property
+    def step(self) -> Array:
+        """The lattice's steps, for the kernels."""
+        return np.array(self.lattice.step)
+
+    @cached_property
+    def arrays(self) -> tuple[NDArray[Any], ...]:
+        """What the kernels read of the model, in their order."""
+        return (
+            self.lanes, self.blocks, self.block_place, self.quads, self.quad_place, self.quad_scale,
+            self.class_of,
+        )  # fmt: skip
 
     @property
     def nbytes(self) -> int:
@@ -138,8 +155,8 @@ def tables_of_leaf(
     quads, quad_place, quad_scale = _quads(leaf, lattice, slacks, majorant, shared, sigma[0])
     angles = lattice.angles
     return Tables(
-        lattice, bound, first, origin, leaf, _kernels.lane_table(leaf), blocks, block_place, quads, quad_place,
-        quad_scale, class_of, reach, np.cos(angles), np.sin(angles), 0.0,
+        lattice, bound, first, origin, leaf, _kernels.lane_table(leaf), blocks, block_place, quads,
+        quad_place, quad_scale, class_of, reach, np.cos(angles), np.sin(angles), 0.0,
     )  # fmt: skip
 
 
@@ -189,11 +206,14 @@ def _majorant_levels(lattice: Lattice, slacks: list[Integers], sigma: float) -> 
     Beyond, a block spans so much of the surface that a quadratic gains nothing over a plain maximum.
     """
     widest = lattice.size[:, :2].max(axis=1)
-    return tuple(
+    levels = [
         h
         for h in range(1, lattice.top + 1)
         if float(widest[h]) <= QUAD_REACH * sigma and float(slacks[h][-1]) <= QUAD_SLACK * sigma
-    )
+    ]
+    while len(levels) > 1 and slacks[levels[-1]][-1] > QUAD_LOOSE * sigma and _cheap(lattice, levels[-2]):
+        levels.pop()
+    return tuple(levels)
 
 
 def _shared_level(lattice: Lattice, slacks: list[Integers], levels: tuple[int, ...], sigma: float) -> int:
@@ -203,14 +223,20 @@ def _shared_level(lattice: Lattice, slacks: list[Integers], levels: tuple[int, .
 
 
 def first_level(lattice: Lattice, lowest: int) -> int:
-    """The level that a search starts on: the finest whose nodes are all cheap to bound."""
+    """The level that a search starts on: the finest from ``lowest`` on whose nodes are all cheap to bound."""
     best = lattice.top
     for level in range(lattice.top, max(lowest, 1) - 1, -1):
-        nodes = lattice.nodes[level]
-        if float(nodes[2]) * NOMINAL * min(12.0, float(nodes[1])) * (1.0 + nodes[0] / 8.0) > ROOT_COST:
+        if not _cheap(lattice, level):
             break
         best = level
     return best
+
+
+def _cheap(lattice: Lattice, level: int) -> bool:
+    """Whether all nodes of a level may be bounded."""
+    nodes = lattice.nodes[level]
+    nu, nv, nt = (float(x) for x in nodes)
+    return nt * NOMINAL * min(12.0, nv) * (1.0 + nu / 8.0) <= ROOT_COST
 
 
 def _overlapped_blocks(
