@@ -31,8 +31,13 @@ def jit_inner(function: Callable[..., Any]) -> Callable[..., Any]:
     return _compiled(function, forceinline=True)
 
 
+def jit_inner_sums(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same for sums."""
+    return _compiled(function, forceinline=True, fastmath={"reassoc", "contract"})
+
+
 def jit_inner_fast(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Both."""
+    """The same with fast arithmetic."""
     return _compiled(function, forceinline=True, fastmath=True)
 
 

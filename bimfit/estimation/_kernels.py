@@ -6,11 +6,12 @@ Beams come sorted by pseudo-angle within groups of one origin each, as arrays:
 ``d``      (2, n) unit directions;  ``r`` (n,) ranges, negative where nothing came back
 ``start``  (g + 1,) first beam of every group;  ``eye`` (g, 4) origin and look direction of every group
 
-The likelihood takes them as one array ``B`` (9, n), whose rows are p, the two of d, and then r; OFF, which is
-added to the log-likelihood whenever the beam is predicted to meet the component; DEEP, besides when its
-return lies more than ``margin`` behind the component; LIMIT, the range at which something else is in the
+The likelihood takes them as one array ``B`` (9, n + PAD), whose rows are p, the two of d, and then r; OFF,
+which is added to the log-likelihood whenever the beam is predicted to meet the component; DEEP, besides when
+its return lies more than ``margin`` behind the component; LIMIT, the range at which something else is in the
 way; INVERSE, 1 / sigma of its range; TOP, log A, the log-odds of a return on the spot against an outlier
-there. No arithmetic that assumes that inf does not exist: misses rely on it.
+there. The last PAD columns are 0, so that sums may go by whole vectors. No arithmetic that assumes that inf
+does not exist: misses rely on it.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bimfit._kernels import jit, jit_sums
+from bimfit._kernels import jit, jit_inner, jit_inner_sums, jit_sums
 from bimfit.geometry.pose import Array
 
 Ints = NDArray[np.int64]
@@ -29,6 +30,7 @@ Ints = NDArray[np.int64]
 RANGE, OFF, DEEP, LIMIT, INVERSE, TOP = 3, 4, 5, 6, 7, 8
 STEEP = 0.3
 NEVER = 1 << 40
+PAD = 8
 
 
 @jit
@@ -296,114 +298,236 @@ def through(
     return passed if 2 * passed >= between else 0
 
 
-@jit_sums
-def _hit(t: float) -> tuple[float, float]:
-    """log(1 + exp(t)) and its derivative without branches or tables, to 1e-5."""
-    x = min(abs(t), 32.0)
-    y = 0.0625 * x
-    h, q = 0.5 * y, y * y / 12.0
-    e = (1.0 - h + q) / (1.0 + h + q)  # exp(-y), then its 16th power
+@jit_inner_sums
+def _decay(x: float) -> float:
+    """exp(-x) for x from 0 to 32 without branches, tables or divisions, to 2e-7."""
+    y = -0.03125 * x
+    e = 1.0 + y * (1.0 + y * (0.5 + y * (0.16666666666666666 + y * 0.041666666666666664)))
+    e *= e  # to the 32nd power
     e *= e
     e *= e
     e *= e
     e *= e
+    return e
+
+
+@jit_inner_sums
+def _gain(t: float) -> float:
+    """log(1 + exp(t)) to 1e-5."""
+    e = _decay(min(abs(t), 32.0))
     # Abramowitz and Stegun 4.1.43
     log = e * (0.99949556 + e * (-0.49190896 + e * (0.28947478 + e * (-0.13606275 + e * 0.03215845))))
-    up = t > 0.0
-    return (t if up else 0.0) + log, (1.0 if up else e) / (1.0 + e)
+    gain: float = max(t, 0.0) + log
+    return gain
+
+
+@jit_inner_sums
+def _weight(t: float) -> float:
+    """exp(t) / (1 + exp(t)), the derivative of the gain."""
+    e = _decay(min(abs(t), 32.0))
+    weight: float = (1.0 if t > 0.0 else e) / (1.0 + e)
+    return weight
 
 
 @jit_sums
 def _total(B: Array, margin: float, rho: Array, face: Ints) -> float:
     """Sum over covered beams of the residual's term and the cost of covering."""
     total = 0.0
-    for k in range(B.shape[1]):
+    for k in range(np.uint64(face.shape[0])):
         z = B[RANGE, k] - rho[k]
         q = z * B[INVERSE, k]
-        value = _hit(B[TOP, k] - 0.5 * q * q)[0] + B[OFF, k] + (B[DEEP, k] if z > margin else 0.0)
+        value = _gain(B[TOP, k] - 0.5 * q * q) + B[OFF, k] + (B[DEEP, k] if z > margin else 0.0)
         total += value if face[k] >= 0 else 0.0
     return total
 
 
 @jit
-def log_likelihood(
-    edges: Array,
-    pose: Array,
-    B: Array,
-    start: Ints,
-    eye: Array,
-    margin: float,
-    bearing: float,
-    rho: Array,
-    face: Ints,
+def scratch(edges: Array, eye: Array) -> tuple[Array, Ints]:
+    """Work space of the likelihood of one component under some beams: lines and runs, see :func:`_front`."""
+    m, groups = edges.shape[0], eye.shape[0]
+    return np.empty((m, 3)), np.zeros((4 * m + 1 + groups * m, 3), np.int64)
+
+
+@jit_inner
+def _from(B: Array, lo: int, hi: int, value: float, hint: int) -> int:
+    """What :func:`_lower` finds, walking from a guess: the last pose's edge was seldom far off."""
+    k = min(max(hint, lo), hi)
+    while k < hi and B[0, k] < value:
+        k += 1
+    while k > lo and B[0, k - 1] >= value:
+        k -= 1
+    return k
+
+
+@jit_inner
+def _insert(B: Array, lines: Array, runs: Ints, count: int, lo: int, hi: int, e: int) -> int:
+    """Add edge ``e``, met by the beams from ``lo`` to ``hi``, to stretches in order; how many there are then.
+
+    Edges of a profile do not cross: which of two comes first on one beam does so on all that meet both.
+    """
+    i = 0
+    while lo < hi:
+        while i < count and runs[i, 1] <= lo:
+            i += 1
+        if i == count or runs[i, 0] > lo:  # free beams
+            stop = hi if i == count else min(hi, runs[i, 0])
+            count = _open(runs, count, i)
+            runs[i, 0], runs[i, 1], runs[i, 2] = lo, stop, e
+            lo = stop
+            continue
+        stop, k, f = min(hi, runs[i, 1]), (lo + min(hi, runs[i, 1])) >> 1, runs[i, 2]
+        mine = lines[e, 2] / (lines[e, 0] * B[1, k] + lines[e, 1] * B[2, k])
+        held = lines[f, 2] / (lines[f, 0] * B[1, k] + lines[f, 1] * B[2, k])
+        if 0.0 < mine < held:
+            if runs[i, 0] < lo:
+                count = _open(runs, count, i)
+                runs[i, 1] = lo
+                i += 1
+            if stop < runs[i, 1]:
+                count = _open(runs, count, i)
+                runs[i + 1, 0] = stop
+            runs[i, 0], runs[i, 1], runs[i, 2] = lo, stop, e
+        lo = stop
+    return count
+
+
+@jit_inner
+def _open(runs: Ints, count: int, i: int) -> int:
+    """Make room for a row before row ``i``, which stays there as a copy."""
+    for k in range(count, i, -1):
+        for j in range(3):
+            runs[k, j] = runs[k - 1, j]
+    return count + 1
+
+
+@jit_inner
+def _front(
+    edges: Array, cos: float, sin: float, tx: float, ty: float, B: Array, start: Ints, eye: Array, g: int,
+    lines: Array, runs: Ints,
+) -> int:  # fmt: skip
+    """Stretches of group ``g``'s beams that meet one edge first: rows (first, end, edge) of the runs.
+
+    The lines become normal n and n.(a - o) of every edge that faces the sensor at o, moved as in
+    :func:`predict`: a beam along d meets it at n.(a - o) / n.d. The last rows of the runs, one a group and
+    edge, keep where the last pose's edges began and ended.
+    """
+    kept = runs.shape[0] - (g + 1) * edges.shape[0]
+    ox, oy, lx, ly = eye[g, 0], eye[g, 1], eye[g, 2], eye[g, 3]
+    s, t = start[g], start[g + 1]
+    count = 0
+    for e in range(edges.shape[0]):
+        nx = cos * edges[e, 4] - sin * edges[e, 5]
+        ny = sin * edges[e, 4] + cos * edges[e, 5]
+        ax = cos * edges[e, 0] - sin * edges[e, 1] + tx - ox
+        ay = sin * edges[e, 0] + cos * edges[e, 1] + ty - oy
+        c = nx * ax + ny * ay
+        if c >= 0.0:
+            continue
+        bx = cos * edges[e, 2] - sin * edges[e, 3] + tx - ox
+        by = sin * edges[e, 2] + cos * edges[e, 3] + ty - oy
+        lines[e, 0], lines[e, 1], lines[e, 2] = nx, ny, c
+        high = pseudo_angle(lx * ax + ly * ay, lx * ay - ly * ax)
+        low = pseudo_angle(lx * bx + ly * by, lx * by - ly * bx)
+        i, j = _from(B, s, t, low, runs[kept + e, 0]), _from(B, s, t, high, runs[kept + e, 1])
+        runs[kept + e, 0], runs[kept + e, 1] = i, j
+        if low <= high:
+            count = _insert(B, lines, runs, count, i, j, e)
+        else:  # the edge lies across the cut behind the sensor
+            count = _insert(B, lines, runs, count, i, t, e)
+            count = _insert(B, lines, runs, count, s, j, e)
+    return count
+
+
+@jit_inner
+def _hidden(B: Array, k: int, nx: float, ny: float, c: float) -> bool:
+    """Whether something else is in the way of beam ``k`` to a face."""
+    return not c / (nx * B[1, k] + ny * B[2, k]) < B[LIMIT, k]
+
+
+@jit_inner_sums
+def _sum(B: Array, first: int, end: int, nx: float, ny: float, c: float, margin: float) -> float:
+    """Sum over a stretch of beams on one face of the residual's term and the cost of covering."""
+    total = 0.0
+    # unsigned: an index that could be negative would keep LLVM from vectorising; whole vectors: no rest
+    for i in range(np.uint64((end - first + PAD - 1) // PAD * PAD)):
+        k = np.uint64(first + i)
+        near = c / (nx * B[1, k] + ny * B[2, k])
+        z = B[RANGE, k] - near
+        q = z * B[INVERSE, k]
+        value = _gain(B[TOP, k] - 0.5 * q * q) + B[OFF, k] + (B[DEEP, k] if z > margin else 0.0)
+        total += value if (near < B[LIMIT, k]) & (near > 0.0) & (i < np.uint64(end - first)) else 0.0
+    return total
+
+
+@jit
+def _steep_sum(
+    B: Array, first: int, end: int, nx: float, ny: float, c: float, margin: float, bearing: float
 ) -> float:
+    """The same on a face met nearly edge-on."""
+    total = 0.0
+    for k in range(first, end):
+        near = c / (nx * B[1, k] + ny * B[2, k])
+        if not 0.0 < near < B[LIMIT, k]:
+            continue
+        z = B[RANGE, k] - near
+        q, lean = z * B[INVERSE, k], near / c
+        grow = 1.0 + (bearing * B[INVERSE, k] * near) ** 2 * (lean * lean - 1.0)
+        total += _gain(B[TOP, k] - 0.5 * (q * q / grow + math.log(grow))) + B[OFF, k]
+        total += B[DEEP, k] if z > margin else 0.0
+    return total
+
+
+@jit
+def log_likelihood(
+    edges: Array, pose: Array, B: Array, start: Ints, eye: Array, margin: float, bearing: float,
+    lines: Array, runs: Ints,
+) -> float:  # fmt: skip
     """Log-likelihood at a pose (tx, ty, theta), as a difference from 'every beam misses'.
 
     A return at r adds log(1 + A exp(-d^2 / 2)), d = (r - rho) / sigma (METHOD, section 4, step 4). Where a
     face is nearly edge-on (|n.d| < STEEP) a range depends on the bearing more than on anything: sigma^2
-    grows there by (bearing's sd * rho tan i)^2.
+    grows there by (bearing's sd * rho tan i)^2. ``lines``, ``runs``:
+    from :func:`scratch`.
     """
-    for k in range(B.shape[1]):
-        rho[k] = B[LIMIT, k]
-        face[k] = -1
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    predict(edges, cos, sin, pose[0], pose[1], B, start, eye, rho, face)
-    total: float = _total(B, margin, rho, face)
-    if bearing > 0.0:
-        total += _steep(edges, cos, sin, B, bearing, rho, face)
-    return total
-
-
-@jit
-def _steep(edges: Array, cos: float, sin: float, B: Array, bearing: float, rho: Array, face: Ints) -> float:
-    """What faces met nearly edge-on add to the sum that took them for others."""
-    edge, steep, c2 = -1, False, 1.0
     total = 0.0
-    for k in range(face.shape[0]):
-        e = face[k]
-        if e < 0:
-            continue
-        if e != edge:
-            edge = e
-            nd = _lean(edges, e, cos, sin, B[1, k], B[2, k])
-            steep = nd > -STEEP
-            c2 = (rho[k] * nd) ** 2
-        if steep:
-            q = (B[RANGE, k] - rho[k]) * B[INVERSE, k]
-            grow = 1.0 + (bearing * B[INVERSE, k] * rho[k]) ** 2 * (rho[k] * rho[k] / c2 - 1.0)
-            total -= _hit(B[TOP, k] - 0.5 * q * q)[0]
-            total += _hit(B[TOP, k] - 0.5 * (q * q / grow + math.log(grow)))[0]
+    for g in range(eye.shape[0]):
+        for i in range(_front(edges, cos, sin, pose[0], pose[1], B, start, eye, g, lines, runs)):
+            first, end, e = runs[i, 0], runs[i, 1], runs[i, 2]
+            nx, ny, c = lines[e, 0], lines[e, 1], lines[e, 2]
+            while first < end and _hidden(B, first, nx, ny, c):
+                first += 1
+            if first == end:
+                continue
+            if bearing > 0.0 and nx * B[1, first] + ny * B[2, first] > -STEEP:
+                total += _steep_sum(B, first, end, nx, ny, c, margin, bearing)
+            else:
+                total += _sum(B, first, end, nx, ny, c, margin)
     return total
 
 
-@jit
-def _lean(edges: Array, e: int, cos: float, sin: float, dx: float, dy: float) -> float:
-    """n.d of a turned edge and a beam."""
-    nx = cos * edges[e, 4] - sin * edges[e, 5]
-    ny = sin * edges[e, 4] + cos * edges[e, 5]
-    lean: float = nx * dx + ny * dy
-    return lean
-
-
-@jit_sums
+@jit_inner_sums
 def _stretch(
     B: Array, first: int, end: int, nx: float, ny: float, c: float, lever: float, slope: float, soft: float,
-    drop: float, bearing: float, rho: Array,
+    drop: float, bearing: float,
 ) -> tuple[float, float, float, float, float]:  # fmt: skip
     """Sums of w f^2, w f^2 arm, w f^2 arm^2, w f z and w f z arm over a stretch of beams on one face."""
     s0 = s1 = s2 = t0 = t1 = 0.0
     over = 1.0 / c
-    for k in range(np.uint64(first), np.uint64(end)):
-        near = rho[k]
-        i = B[INVERSE, k] * soft
+    for j in range(np.uint64((end - first + PAD - 1) // PAD * PAD)):
+        k = np.uint64(first + j)
+        near = c / (nx * B[1, k] + ny * B[2, k])
+        seen = (near < B[LIMIT, k]) & (near > 0.0) & (j < np.uint64(end - first))
+        near = near if seen else 0.0
+        i = B[INVERSE, k] * soft if seen else 0.0
         z = (B[RANGE, k] - near) * i
         top = B[TOP, k] - drop
         if bearing > 0.0:  # the same for the whole stretch
             lean = near * over
             grow = 1.0 + (bearing * B[INVERSE, k] * near) ** 2 * (lean * lean - 1.0)
-            w = _hit(top - 0.5 * (z * z / grow + math.log(grow)))[1] / grow
+            w = _weight(top - 0.5 * (z * z / grow + math.log(grow))) / grow
         else:
-            w = _hit(top - 0.5 * z * z)[1]
+            w = _weight(top - 0.5 * z * z)
         # rho / c = 1 / (n.d)
         f = near * i * over
         arm = lever + slope * near * (ny * B[1, k] - nx * B[2, k])
@@ -418,54 +542,35 @@ def _stretch(
 
 @jit
 def normal_equations(
-    edges: Array,
-    pose: Array,
-    rs: float,
-    B: Array,
-    start: Ints,
-    eye: Array,
-    soften: float,
-    grazes: int,
-    bearing: float,
-    rho: Array,
-    face: Ints,
-    H: Array,
-    g: Array,
-) -> None:
+    edges: Array, pose: Array, rs: float, B: Array, start: Ints, eye: Array, soften: float, grazes: int,
+    bearing: float, lines: Array, runs: Ints, H: Array, g: Array,
+) -> None:  # fmt: skip
     """Gauss-Newton system of the ranges in (tx, ty, theta * rs), rotation about the origin of ``edges``.
 
     Weights a / (1 + a), a = A / m exp(-d^2 / (2 m^2)), m = ``soften`` times sigma. A face met nearly edge-on
-    counts from ``grazes`` returns on: the Jacobian of a few claims more than they say.
+    counts from ``grazes`` returns on: the Jacobian of a few claims more than they say. ``lines``, ``runs``:
+    from :func:`scratch`.
     """
-    for k in range(B.shape[1]):
-        rho[k] = B[LIMIT, k]
-        face[k] = -1
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    predict(edges, cos, sin, pose[0], pose[1], B, start, eye, rho, face)
     H[:] = 0.0
     g[:] = 0.0
     soft, drop, slope = 1.0 / soften, math.log(soften), 1.0 / rs
     for q in range(eye.shape[0]):
         ox, oy = eye[q, 0] - pose[0], eye[q, 1] - pose[1]
-        k, end = start[q], start[q + 1]
-        while k < end:
-            e = face[k]
-            first = k
-            k += 1
-            if e < 0:
+        for i in range(_front(edges, cos, sin, pose[0], pose[1], B, start, eye, q, lines, runs)):
+            first, end, e = runs[i, 0], runs[i, 1], runs[i, 2]
+            nx, ny, c = lines[e, 0], lines[e, 1], lines[e, 2]
+            while first < end and _hidden(B, first, nx, ny, c):
+                first += 1
+            if first == end:
                 continue
-            while k < end and face[k] == e:
-                k += 1
-            # one stretch on one face: n.(a - o) is common to it, and so is the Jacobian's direction
-            nx = cos * edges[e, 4] - sin * edges[e, 5]
-            ny = sin * edges[e, 4] + cos * edges[e, 5]
-            nd = nx * B[1, first] + ny * B[2, first]
-            steep = nd > -STEEP
-            if steep and k - first < grazes:
+            steep = nx * B[1, first] + ny * B[2, first] > -STEEP
+            if steep and end - first < grazes:
                 continue
+            # n.(a - o) is common to a stretch on one face, and so is the Jacobian's direction
             s0, s1, s2, t0, t1 = _stretch(
-                B, first, k, nx, ny, rho[first] * nd, (ny * ox - nx * oy) / rs, slope, soft, drop,
-                bearing if steep else 0.0, rho,
+                B, first, end, nx, ny, c, (ny * ox - nx * oy) / rs, slope, soft, drop,
+                bearing if steep else 0.0,
             )  # fmt: skip
             H[0, 0] += nx * nx * s0
             H[0, 1] += nx * ny * s0
@@ -498,7 +603,7 @@ def slide(
     margin: float, prior: float, scores: Array,
 ) -> None:  # fmt: skip
     """Score the union of both components at ``pose`` shifted by every (du, dv) row of ``steps``."""
-    n = B.shape[1]
+    n = start[start.shape[0] - 1]
     rho = np.empty(n)
     face = np.empty(n, np.int64)
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
@@ -570,14 +675,12 @@ def posterior(
         rival mass, rival offset along the weak axis, log-likelihood at the mean, log-posterior at its mode,
         effective number of nodes, 1 where sampling replaced the quadrature.
     """
-    n = B.shape[1]
-    rho = np.empty(n)
-    face = np.empty(n, np.int64)
+    lines, runs = scratch(edges, eye)
     H, g, pose = np.empty((3, 3)), np.empty(3), np.empty(3)
     pinv = np.array([1.0 / prior[0] ** 2, 1.0 / prior[1] ** 2, 1.0 / (prior[2] * rs) ** 2])
     args = (edges, rs, B, start, eye, margin, bearing, prior, pinv)
     q = np.array([begin[0], begin[1], begin[2] * rs])
-    _pilot(args, q, rho, face, H, g, pose)
+    _pilot(args, q, lines, runs, H, g, pose)
     nodes = 25
     mid = nodes // 2
     w = np.zeros((nodes, 2))
@@ -586,8 +689,8 @@ def posterior(
     mixed, step, top = False, 0.0, 0.0
     for _ in range(4):
         pose[0], pose[1], pose[2] = q[0], q[1], q[2] / rs
-        normal_equations(edges, pose, rs, B, start, eye, 1.0, NEVER, bearing, rho, face, H, g)
-        mixed = _two_orientations(edges, face, B[RANGE])
+        normal_equations(edges, pose, rs, B, start, eye, 1.0, NEVER, bearing, lines, runs, H, g)
+        mixed = _two_orientations(edges, pose, B, start, eye, lines, runs)
         raw[:] = H
         for i in range(3):
             H[i, i] += pinv[i]
@@ -600,7 +703,7 @@ def posterior(
                 P2[i, j] = 0.0
                 for a in range(3):
                     P2[i, j] += axes[a, 1 + i] * axes[a, 1 + j] * pinv[a]
-        top = _profile(args, q, axes, step, P2, rho, face, w, best)
+        top = _profile(args, q, axes, step, P2, lines, runs, w, best)
         i = int(np.argmax(best))
         if 1 < i < nodes - 2 or abs(q[0]) + abs(q[1]) > 4.0 * window:
             break
@@ -625,7 +728,7 @@ def posterior(
     info[2], info[3], info[4] = axes[0, 0], axes[1, 0], axes[2, 0]
     info[5] = math.sqrt(max(_along(cov, axes), 0.0))
     pose[0], pose[1], pose[2] = mean[0], mean[1], mean[2] / rs
-    info[8] = log_likelihood(edges, pose, B, start, eye, margin, bearing, rho, face)
+    info[8] = log_likelihood(edges, pose, B, start, eye, margin, bearing, lines, runs)
 
 
 @jit
@@ -664,7 +767,7 @@ def component(
     n = 0
     for k in range(use.shape[0]):
         n += int(use[k])
-    B = np.empty((every.shape[0], n))
+    B = np.zeros((every.shape[0], n + PAD))
     start2 = np.empty(start.shape[0], np.int64)
     i = 0
     for g in range(eye.shape[0]):
@@ -781,14 +884,16 @@ def _along(m: Array, axes: Array) -> float:
 
 
 @jit
-def _pilot(args: tuple[Any, ...], q: Array, rho: Array, face: Ints, H: Array, g: Array, pose: Array) -> None:
+def _pilot(
+    args: tuple[Any, ...], q: Array, lines: Array, runs: Ints, H: Array, g: Array, pose: Array
+) -> None:
     """Six annealed Gauss-Newton steps from q; q becomes the best place passed."""
     edges, rs, B, start, eye, margin, bearing, prior, pinv = args
     x, at = np.empty(3), q.copy()
     top = -np.inf
     for it in range(7):
         pose[0], pose[1], pose[2] = at[0], at[1], at[2] / rs
-        value = log_likelihood(edges, pose, B, start, eye, margin, bearing, rho, face) + _log_prior(
+        value = log_likelihood(edges, pose, B, start, eye, margin, bearing, lines, runs) + _log_prior(
             pose, prior
         )
         if value > top:
@@ -797,7 +902,7 @@ def _pilot(args: tuple[Any, ...], q: Array, rho: Array, face: Ints, H: Array, g:
         if it == 6:
             break
         m = 4.0 if it < 2 else (2.0 if it < 4 else 1.0)
-        normal_equations(edges, pose, rs, B, start, eye, m, NEVER, bearing, rho, face, H, g)
+        normal_equations(edges, pose, rs, B, start, eye, m, NEVER, bearing, lines, runs, H, g)
         for i in range(3):
             H[i, i] += 1.1 * pinv[i]
             g[i] -= pinv[i] * at[i]
@@ -807,8 +912,8 @@ def _pilot(args: tuple[Any, ...], q: Array, rho: Array, face: Ints, H: Array, g:
 
 @jit
 def _profile(
-    args: tuple[Any, ...], q: Array, axes: Array, step: float, P2: Array, rho: Array, face: Ints, w: Array,
-    best: Array,
+    args: tuple[Any, ...], q: Array, axes: Array, step: float, P2: Array, lines: Array, runs: Ints,
+    w: Array, best: Array,
 ) -> float:  # fmt: skip
     """Log marginal along the weak direction, from the middle node outwards; returns its maximum."""
     edges, rs, B, start, eye, margin, bearing, prior, _ = args
@@ -823,24 +928,32 @@ def _profile(
         elif i < mid:
             w[i] = w[i + 1]
         for _ in range(2):
-            _conditional_step(args, q, axes, (i - mid) * step, w[i], P2, rho, face, H, g, pose, L)
+            _conditional_step(args, q, axes, (i - mid) * step, w[i], P2, lines, runs, H, g, pose, L)
         _pose_at(q, axes, (i - mid) * step, w[i, 0], w[i, 1], rs, pose)
-        value = log_likelihood(edges, pose, B, start, eye, margin, bearing, rho, face)
+        value = log_likelihood(edges, pose, B, start, eye, margin, bearing, lines, runs)
         best[i] = value + _log_prior(pose, prior) - math.log(L[0, 0] * L[1, 1])
     return float(best.max())
 
 
 @jit
-def _two_orientations(edges: Array, face: Ints, r: Array) -> bool:
+def _two_orientations(
+    edges: Array, pose: Array, B: Array, start: Ints, eye: Array, lines: Array, runs: Ints
+) -> bool:
     """Whether the returns lie on faces that differ by more than 20 degrees."""
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
     ref = -1
-    for k in range(face.shape[0]):
-        if face[k] < 0 or r[k] < 0.0:
-            continue
-        if ref < 0:
-            ref = face[k]
-        elif edges[ref, 4] * edges[face[k], 4] + edges[ref, 5] * edges[face[k], 5] < 0.94:
-            return True
+    for g in range(eye.shape[0]):
+        for i in range(_front(edges, cos, sin, pose[0], pose[1], B, start, eye, g, lines, runs)):
+            e, k, end = runs[i, 2], runs[i, 0], runs[i, 1]
+            nx, ny, c = lines[e, 0], lines[e, 1], lines[e, 2]
+            while k < end and (B[RANGE, k] < 0.0 or _hidden(B, k, nx, ny, c)):
+                k += 1
+            if k == end:
+                continue
+            if ref < 0:
+                ref = e
+            elif edges[ref, 4] * edges[e, 4] + edges[ref, 5] * edges[e, 5] < 0.94:
+                return True
     return False
 
 
@@ -852,8 +965,8 @@ def _conditional_step(
     s: float,
     w: Array,
     P2: Array,
-    rho: Array,
-    face: Ints,
+    lines: Array,
+    runs: Ints,
     H: Array,
     g: Array,
     pose: Array,
@@ -862,7 +975,7 @@ def _conditional_step(
     """One Gauss-Newton step of w at fixed s; L becomes the Cholesky factor of its information."""
     edges, rs, B, start, eye, _, bearing, _, pinv = args
     _pose_at(q, axes, s, w[0], w[1], rs, pose)
-    normal_equations(edges, pose, rs, B, start, eye, 1.0, 2, bearing, rho, face, H, g)
+    normal_equations(edges, pose, rs, B, start, eye, 1.0, 2, bearing, lines, runs, H, g)
     pose[2] *= rs
     for i in range(3):
         g[i] -= pinv[i] * pose[i]
@@ -918,9 +1031,7 @@ def _integrate(
         lw = np.log(np.array([2.0 / 3.0, 1.0 / 6.0, 1.0 / 6.0]))
     if hi - lo > 0.008:
         cells *= 2
-    n = B.shape[1]
-    rho = np.empty(n)
-    face = np.empty(n, np.int64)
+    lines, runs = scratch(edges, eye)
     H, g, pose = np.empty((3, 3)), np.empty(3), np.empty(3)
     wc, L = np.empty(2), np.empty((2, 2))
     m = xs.shape[0]
@@ -941,7 +1052,7 @@ def _integrate(
                 continue
             wc[0] = w[i, 0] + f * (w[i + 1, 0] - w[i, 0])
             wc[1] = w[i, 1] + f * (w[i + 1, 1] - w[i, 1])
-            _conditional_step(args, q, axes, s, wc, P2, rho, face, H, g, pose, L)
+            _conditional_step(args, q, axes, s, wc, P2, lines, runs, H, g, pose, L)
             base = math.log(2.0 * math.pi * h) - math.log(L[0, 0] * L[1, 1])
             for a in range(m):
                 for b in range(m):
@@ -949,7 +1060,7 @@ def _integrate(
                     y0 = (xs[a] - L[1, 0] * y1) / L[0, 0]
                     _pose_at(q, axes, s, wc[0] + y0, wc[1] + y1, rs, pose)
                     value = log_likelihood(
-                        edges, pose, B, start, eye, margin, bearing, rho, face
+                        edges, pose, B, start, eye, margin, bearing, lines, runs
                     ) + _log_prior(pose, prior)
                     mode = max(mode, value)
                     values[count] = value + 0.5 * (xs[a] * xs[a] + xs[b] * xs[b]) + lw[a] + lw[b] + base
@@ -1055,8 +1166,7 @@ def _sample(
     """
     edges, rs, B, start, eye, margin, bearing, prior, _ = args
     n = draws.shape[0]
-    rho = np.empty(B.shape[1])
-    face = np.empty(B.shape[1], np.int64)
+    lines, runs = scratch(edges, eye)
     pose = np.empty(3)
     centre = q.copy()
     shape = 2.0 * np.linalg.inv(H)
@@ -1071,7 +1181,7 @@ def _sample(
                 for b in range(a + 1):
                     x[i, a] += L[a, b] * draws[i, b]
             pose[0], pose[1], pose[2] = x[i, 0], x[i, 1], x[i, 2] / rs
-            target[i] = log_likelihood(edges, pose, B, start, eye, margin, bearing, rho, face)
+            target[i] = log_likelihood(edges, pose, B, start, eye, margin, bearing, lines, runs)
             before[i] = _log_prior(pose, prior)
         low, power = power, 1.0
         for _ in range(12):

@@ -118,17 +118,18 @@ class Cost:
 
 
 def packed(beams: BeamSet, cost: Cost, model: BeamModel, *, alike: bool = False) -> Array:
-    """Beams and what is known of each, shape (9, n), as the kernels' likelihood takes them.
+    """Beams and what is known of each, shape (9, n + PAD), as the kernels' likelihood takes them.
 
     ``alike`` where the model's sigma is another one than the sensor's: then beams count alike.
     """
-    out = np.empty((9, len(beams)))
-    out[:3], out[_kernels.RANGE] = beams.rays, beams.r
-    out[_kernels.OFF], out[_kernels.DEEP], out[_kernels.LIMIT] = cost.off, cost.deep, cost.limit
-    out[_kernels.INVERSE], out[_kernels.TOP] = 1.0 / model.sigma, math.log(model.amplitude)
+    n = len(beams)
+    out = np.zeros((9, n + _kernels.PAD))
+    out[:3, :n], out[_kernels.RANGE, :n] = beams.rays, beams.r
+    out[_kernels.OFF, :n], out[_kernels.DEEP, :n], out[_kernels.LIMIT, :n] = cost.off, cost.deep, cost.limit
+    out[_kernels.INVERSE, :n], out[_kernels.TOP, :n] = 1.0 / model.sigma, math.log(model.amplitude)
     if beams.scale is not None and not alike:
-        out[_kernels.INVERSE] /= beams.scale
-        out[_kernels.TOP] -= np.log(beams.scale)
+        out[_kernels.INVERSE, :n] /= beams.scale
+        out[_kernels.TOP, :n] -= np.log(beams.scale)
     return out
 
 

@@ -111,7 +111,6 @@ def test_information_of_a_flat_face_is_the_closed_form():
         [np.cos(alpha) / np.cos(beta), np.sin(alpha) / np.cos(beta), rho[top] * np.tan(beta)], axis=1
     )
     expected = g.T @ g / model.sigma**2
-    n = len(set_)
     H, b = np.empty((3, 3)), np.empty(3)
     # rotation about the sensor, as the closed form has it
     local = set_.moved_origin(np.array([0.0, 0.25]))
@@ -119,7 +118,7 @@ def test_information_of_a_flat_face_is_the_closed_form():
     exact = dataclasses.replace(local, r=np.where(top, rho, -1e9))
     _kernels.normal_equations(
         rows, np.zeros(3), 1.0, packed(exact, cost, model), local.start, local.eye, 1.0, 1 << 40, 0.0,
-        np.empty(n), np.empty(n, np.int64), H, b,
+        *_kernels.scratch(rows, local.eye), H, b,
     )  # fmt: skip
     assert np.allclose(np.abs(H), np.abs(expected), rtol=1e-3, atol=1e-3 * np.abs(expected).max())
     assert np.allclose(np.diag(H), np.diag(expected), rtol=1e-3)
@@ -133,8 +132,7 @@ def _lattice(rows, pivot, radius, set_, model, cost, window, around, half, n=41)
     moved = rows.copy()
     moved[:, 0:2] -= pivot
     moved[:, 2:4] -= pivot
-    rho, face = np.empty(len(set_)), np.empty(len(set_), np.int64)
-    after = (local.start, local.eye, cost.margin, 0.05 * set_.spacing, rho, face)
+    after = (local.start, local.eye, cost.margin, 0.05 * set_.spacing, *_kernels.scratch(moved, local.eye))
     B = packed(local, cost, model)
     value = np.array([_kernels.log_likelihood(moved, x, B, *after) for x in X])
     value -= 0.5 * np.sum((X / (window.shift, window.shift, window.angle)) ** 2, axis=1)
@@ -188,21 +186,41 @@ def test_kernels_do_what_their_python_does():
     assert np.allclose(rho[face >= 0], slow[face >= 0], rtol=1e-12)
     B = packed(set_, cost, model)
     common = (rows, np.array([1e-3, -2e-3, 0.02]), B, set_.start, set_.eye, cost.margin)
-    fast = _kernels.log_likelihood(*common, 3e-4, rho, face)
-    assert fast == pytest.approx(_kernels.log_likelihood.py_func(*common, 3e-4, rho, face), rel=1e-12)
+    space = _kernels.scratch(rows, set_.eye)
+    fast = _kernels.log_likelihood(*common, 3e-4, *space)
+    assert fast == pytest.approx(_kernels.log_likelihood.py_func(*common, 3e-4, *space), rel=1e-12)
     covered = face >= 0
     d2 = ((set_.r - rho) / model.sigma) ** 2
     a = model.amplitude * np.exp(-0.5 * d2)
     naive = np.sum(np.where(covered, np.log1p(a) + cost.off, 0.0))
-    flat = _kernels.log_likelihood(*common, 0.0, rho, face)
+    flat = _kernels.log_likelihood(*common, 0.0, *space)
     assert flat == pytest.approx(naive, abs=1e-3)
 
 
 def test_the_likelihood_of_one_return_is_the_softplus_of_its_odds():
     t = np.r_[-np.inf, np.linspace(-60.0, 60.0, 4001)]
-    found = np.array([_kernels._hit(x) for x in t])
-    assert np.allclose(found[:, 0], np.logaddexp(0.0, t), atol=2e-5)
-    assert np.allclose(found[:, 1], scipy.special.expit(t), atol=2e-5)
+    assert np.allclose([_kernels._gain(x) for x in t], np.logaddexp(0.0, t), atol=2e-5)
+    assert np.allclose([_kernels._weight(x) for x in t], scipy.special.expit(t), atol=1e-6)
+
+
+@pytest.mark.parametrize("eye", [(0.0, 0.25), (-0.3, 0.1), (-0.03, 0.05)])
+def test_stretches_of_beams_meet_the_edges_that_are_predicted_beam_by_beam(eye):
+    """A notched profile hides its own edges; the sums over stretches are those over single beams."""
+    rng = np.random.default_rng(5)
+    set_ = BeamSet.of(_fan(eye, half=250, look=math.atan2(-eye[1], -0.1 - eye[0]), step=STEP))
+    rows, model = edge_rows(NOTCHED), BeamModel.of(SensorConfig(sigma=0.003))
+    rho, face = predict_ranges(rows, set_)
+    assert len(np.unique(face)) > 3
+    seen = dataclasses.replace(set_, r=np.where(face >= 0, rho, 0.5) + rng.normal(0.0, 0.003, len(set_)))
+    limit = np.where(rng.random(len(set_)) < 0.1, 0.01, np.inf)
+    cost = Cost(rng.normal(0.0, 1.0, len(set_)), np.zeros(len(set_)), 1.0, limit)
+    total = _kernels.log_likelihood(
+        rows, np.zeros(3), packed(seen, cost, model), seen.start, seen.eye, cost.margin, 0.0,
+        *_kernels.scratch(rows, seen.eye),
+    )  # fmt: skip
+    covered = (face >= 0) & (rho < limit)
+    odds = math.log(model.amplitude) - 0.5 * ((seen.r - rho)[covered] / model.sigma) ** 2
+    assert total == pytest.approx(np.sum(np.logaddexp(0.0, odds) + cost.off[covered]), abs=1e-2)
 
 
 def test_a_return_from_behind_counts_only_where_something_should_have_stopped_it():
@@ -215,6 +233,6 @@ def test_a_return_from_behind_counts_only_where_something_should_have_stopped_it
     cost = Cost(np.zeros(n), np.full(n, model.past), 0.012, np.full(n, np.inf))
     B = packed(dataclasses.replace(set_, r=behind), cost, model)
     total = _kernels.log_likelihood(
-        rows, np.zeros(3), B, set_.start, set_.eye, cost.margin, 0.0, np.empty(n), np.empty(n, np.int64)
+        rows, np.zeros(3), B, set_.start, set_.eye, cost.margin, 0.0, *_kernels.scratch(rows, set_.eye)
     )
     assert total == pytest.approx(model.past * covered.sum(), rel=1e-9)
