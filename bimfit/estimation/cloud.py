@@ -10,7 +10,6 @@ import numpy as np
 
 from bimfit.config import SensorConfig
 from bimfit.estimation.likelihood import usual_step
-from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.pose import Array, Pose2D
 from bimfit.geometry.slice import Beams, Slice
 
@@ -44,9 +43,7 @@ class VirtualBeams:
     reason: str
 
 
-def virtual_beams(
-    slice_: Slice, section: JointSection, combined: Pose2D, sensor: SensorConfig
-) -> VirtualBeams:
+def virtual_beams(slice_: Slice, combined: Pose2D) -> VirtualBeams:
     """Look at the points from a virtual sensor and fill holes in bearing with missing beams.
 
     The sensor stands where the slice says; else where it makes the bearings most regular, if that is

@@ -167,7 +167,7 @@ def _context(
     virtual = None
     own, (sensor, distance) = sensor, _here(sensor, slice_)
     if slice_.beams is None or len(slice_.beams.ranges) == 0:
-        virtual = virtual_beams(slice_, section, combined, sensor)
+        virtual = virtual_beams(slice_, combined)
         beams = BeamSet.of(virtual.beams)
         if not virtual.spacing_known:
             sensor = irregular_sensor(sensor)

@@ -28,6 +28,8 @@ _NEAR_MOUTH = 0.015
 _LEAST = 3
 _PIECE = 4
 """Cells, of half a beam each, that a straight piece needs."""
+_BEND = 30.0
+"""What a corner must explain: it costs three parameters, one of which looks for the best of many places."""
 _TURN = math.radians(8.0)
 
 
@@ -75,7 +77,7 @@ def _component(
     # from the gap outwards
     if np.hypot(*(points[0] - designed[0])) > np.hypot(*(points[-1] - designed[0])):
         points, open_end = points[::-1], open_end[::-1]
-    return _closed(points, designed, closed_outside=open_end[1])
+    return closed_profile(points, designed, closed_outside=open_end[1])
 
 
 def _gathered(
@@ -118,7 +120,9 @@ def _gathered(
     return eye, bearings, np.where(beyond, np.hypot(*way.T), np.nan), float(np.nanmedian(steps))
 
 
-def surface_line(bearings: Array, ranges: Array, step: float, sigma: float) -> tuple[Array, list[bool]]:
+def surface_line(
+    bearings: Array, ranges: Array, step: float, sigma: float, *, least: int = _LEAST
+) -> tuple[Array, list[bool]]:
     """Straight pieces through the surface seen at these bearings.
 
     Parameters
@@ -129,6 +133,8 @@ def surface_line(bearings: Array, ranges: Array, step: float, sigma: float) -> t
         Between neighbouring beams of one sweep, rad.
     sigma : float
         Of a range, m.
+    least : int
+        Returns that each cell of half a beam needs; 1 for a single slice.
 
     Returns
     -------
@@ -142,17 +148,19 @@ def surface_line(bearings: Array, ranges: Array, step: float, sigma: float) -> t
     low, high = _extent(b, np.isfinite(r), step)
     inside = (b >= low) & (b <= high) & np.isfinite(r)
     b_in, r_in = b[inside], r[inside]
-    if len(b_in) < 2 * _LEAST:
+    if len(b_in) < max(2 * least, 2 * _PIECE):
         return np.zeros((0, 2)), [False, False]
     width = 0.5 * step
     cell = np.floor((b_in - low) / width).astype(np.int64)
     _, start, count = np.unique(cell, return_index=True, return_counts=True)
-    parts = [slice(s, s + c) for s, c in zip(start.tolist(), count.tolist(), strict=True) if c >= _LEAST]
+    parts = [slice(s, s + c) for s, c in zip(start.tolist(), count.tolist(), strict=True) if c >= least]
     if len(parts) < 2:
         return np.zeros((0, 2)), [False, False]
     middles = np.array([b_in[p].mean() for p in parts])
     levels = np.array([np.median(r_in[p]) for p in parts])
-    noise = np.array([1.25 * sigma / math.sqrt(p.stop - p.start) for p in parts])
+    size = np.array([p.stop - p.start for p in parts])
+    # a median of many deviates 1.25 times as much as their mean
+    noise = np.where(size > 1, 1.25, 1.0) * sigma / np.sqrt(size)
     xy = levels[:, None] * np.column_stack([np.cos(middles), np.sin(middles)])
     first, last = _grazed(xy, noise), len(xy) - _grazed(xy[::-1], noise[::-1])
     if first:
@@ -189,36 +197,37 @@ def _extent(b: Array, hit: NDArray[np.bool_], step: float) -> tuple[float, float
 
 
 def _corners(xy: Array, noise: Array) -> list[int]:
-    """Where straight pieces meet: the farthest point from a chord splits it while noise cannot explain it."""
+    """Where straight pieces meet: a piece is split while two explain it better than noise can."""
     out = [0, len(xy) - 1]
     stack = [(0, len(xy) - 1)]
     while stack:
         i, j = stack.pop()
         if j - i < 2 * _PIECE:
             continue
-        fit, normal = _line(xy[i : j + 1], noise[i : j + 1])
-        z = ((xy[i : j + 1] - fit) @ normal) / noise[i : j + 1]
-        z2 = float(z @ z)
-        n = j - i - 1
-        if z2 < n + 5.0 * math.sqrt(2.0 * n):
+        piece = slice(i, j + 1)
+        at, cost = _split(xy[piece], noise[piece])
+        if _misfit(xy[piece], noise[piece]) - cost < _BEND:
             continue
-        k = i + _split(xy[i : j + 1], noise[i : j + 1])
+        k = i + at
         out.append(k)
         stack += [(i, k), (k, j)]
     return sorted(set(out))
 
 
-def _split(xy: Array, noise: Array) -> int:
-    """The place where two lines, each with its own fit, leave the least unexplained."""
+def _misfit(xy: Array, noise: Array) -> float:
+    """Sum of squares, in deviations, that a straight piece leaves."""
+    centre, normal = _line(xy, noise)
+    return float(np.sum((((xy - centre) @ normal) / noise) ** 2))
+
+
+def _split(xy: Array, noise: Array) -> tuple[int, float]:
+    """The place where two lines, each with its own fit, leave the least unexplained, and how much."""
     best, at = math.inf, len(xy) // 2
     for k in range(_PIECE, len(xy) - _PIECE):
-        cost = 0.0
-        for part in (slice(0, k + 1), slice(k, len(xy))):
-            fit, normal = _line(xy[part], noise[part])
-            cost += float(np.sum((((xy[part] - fit) @ normal) / noise[part]) ** 2))
+        cost = _misfit(xy[: k + 1], noise[: k + 1]) + _misfit(xy[k:], noise[k:])
         if cost < best:
             best, at = cost, k
-    return at
+    return at, best
 
 
 def _line(xy: Array, noise: Array, rounds: int = 1) -> tuple[Array, Array]:
@@ -267,8 +276,18 @@ def _foot(point: Array, line: tuple[Array, Array]) -> Array:
     return np.asarray(point - ((point - centre) @ normal) * normal)
 
 
-def _closed(points: Array, designed: Array, *, closed_outside: bool) -> tuple[Profile, Array]:
-    """A profile and its side of the gap from a surface line that runs from the gap outwards."""
+def closed_profile(points: Array, designed: Array, *, closed_outside: bool) -> tuple[Profile, Array]:
+    """A profile and its side of the gap from a surface line that runs from the gap outwards.
+
+    Parameters
+    ----------
+    points : ndarray, shape (k, 2)
+        What is seen, from the gap outwards.
+    designed : ndarray, shape (m, 2)
+        The side of the gap from about its mouth corner on; what is not seen is taken from it.
+    closed_outside : bool
+        Whether the component really ends where the line does.
+    """
     away = np.hypot(*(points - designed[0]).T)
     near = np.flatnonzero(away < _NEAR_MOUTH)
     mouth = int(near[np.argmax(_turns(points)[near])]) if len(near) else int(np.argmin(away))

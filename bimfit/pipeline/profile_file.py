@@ -41,6 +41,10 @@ class TaughtProfile:
     gap: GapOutline
     taught: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
+    def from_source(self, **said: Any) -> TaughtProfile:
+        """The same, saying where it is from as well."""
+        return dataclasses.replace(self, taught={**said, **self.taught})
+
     def applied(self, sections: Sequence[JointSection]) -> tuple[JointSection, ...]:
         """These sections with the taught shape in place of the design."""
         return tuple(dataclasses.replace(s, components=self.components, gap=self.gap) for s in sections)

@@ -20,9 +20,11 @@ from bimfit.pipeline.fit import fit_joint
 from bimfit.pipeline.profile_file import TaughtProfile, read_profile, write_profile
 from bimfit.pipeline.samples import sample_model
 from bimfit.pipeline.simulate import designed, longest_open
-from bimfit.pipeline.survey import model_joints
+from bimfit.pipeline.survey import model_joints, mouth_paths
 from bimfit.pipeline.teach import spread, taught
+from bimfit.scan.formats import write_scan
 from bimfit.simulation.motion import random_truth
+from bimfit.simulation.rangefinder import simulate_scan
 from bimfit.simulation.scenario import Scenario
 
 
@@ -41,16 +43,16 @@ def scene():
 
 def test_a_taught_profile_is_what_is_there_and_not_what_was_designed(scene):
     joint, sections, real, slices, config = scene
-    section, used = taught(sections, slices, config)
-    assert used >= 25
+    profile = taught(sections, slices, config)
+    assert profile.taught["slices"] >= 25
+    assert "disagreement" not in profile.taught
     for which in (0, 1):
-        side, true, drawn = ((s.gap.side_a, s.gap.side_b)[which] for s in (section, real[0], sections[0]))
+        side, true, drawn = ((s.gap.side_a, s.gap.side_b)[which] for s in (profile, real[0], sections[0]))
         bevel = shapely.LineString(true[:2])
         own = shapely.hausdorff_distance(shapely.LineString(side[:2]), bevel)
         assert own < 0.0012
         assert shapely.hausdorff_distance(shapely.LineString(drawn[:2]), bevel) > 1.5 * own
-        assert section.components[which].area > 0.0
-    profile = TaughtProfile(section.components, section.gap)
+        assert profile.components[which].area > 0.0
     fits = [
         fit_joint(joint, design, slices, config, motion="independent", threads=1)
         for design in (sections, profile.applied(sections))
@@ -61,11 +63,28 @@ def test_a_taught_profile_is_what_is_there_and_not_what_was_designed(scene):
     assert rms[1] < rms[0]
 
 
-def test_teaching_wants_beams_and_enough_slices(scene):
-    _, sections, _, slices, config = scene
-    bare = [dataclasses.replace(cut, beams=None) for cut in slices]
-    with pytest.raises(ScanError, match="beams"):
-        taught(sections, bare, config)
+def test_slices_that_show_two_shapes_are_told(scene):
+    _, sections, _, _, config = scene
+    turned = {"bevel-angle": 0.18}
+    mixed = tuple(
+        deformed(deformed(s, 0, turned), 1, turned) if k < len(sections) // 2 else s
+        for k, s in enumerate(sections)
+    )
+    scenario = Scenario(spacing=0.03, sigma=0.0015)
+    truth = random_truth(sections, scenario, 8, joint_id="x", elements=("a", "b"))
+    profile = taught(sections, scanned(mixed, truth, scenario, 8), config)
+    assert "do not show one shape" in profile.taught["disagreement"]
+
+
+def test_points_teach_as_beams_do_and_two_slices_do_not(scene):
+    _, sections, real, slices, config = scene
+    profile = taught(sections, [dataclasses.replace(cut, beams=None) for cut in slices], config)
+    for taught_side, true in (
+        (profile.gap.side_a, real[0].gap.side_a),
+        (profile.gap.side_b, real[0].gap.side_b),
+    ):
+        own = shapely.LineString(taught_side[:2])
+        assert shapely.hausdorff_distance(own, shapely.LineString(true[:2])) < 0.0015
     with pytest.raises(ScanError, match="only 2 of 2"):
         taught(sections[:2], slices[:2], config)
     assert spread(10, 4) == [0, 3, 6, 9]
@@ -134,3 +153,65 @@ def test_teach_and_fit_on_the_command_line(tmp_path, capsys):
     assert "s.csv" in capsys.readouterr().err
     assert not (tmp_path / "no").exists()
     assert main(["teach", scan, "--model", model, "-o", scan]) == 2
+
+
+def _angles(component, side):
+    """Of the face in the gap against the outer face, rad: what no motion changes."""
+    mouth, deep = side[0], side[1]
+    loop = component.loops[0]
+    k = int(np.argmin(np.hypot(*(loop - mouth).T)))
+    ways = [loop[(k + step) % len(loop)] - mouth for step in (1, -1)]
+    out = min(ways, key=lambda way: abs(way @ (deep - mouth)) / np.hypot(*way))
+    cosine = (out @ (deep - mouth)) / np.hypot(*out) / np.hypot(*(deep - mouth))
+    return float(np.arccos(cosine))
+
+
+@pytest.mark.parametrize("form", ["beams", "points"])
+def test_a_line_and_a_scan_teach_a_profile_without_a_model(tmp_path, capsys, form):
+    model, found = model_joints(sample_model("v-groove.ifc"), Config().joints)
+    joint = longest_open(found)
+    scenario = Scenario(spacing=0.03, sigma=0.0015)
+    sections = designed(model, joint, scenario)
+    truth = random_truth(sections, scenario, 8, joint_id=joint.id, elements=joint.elements)
+    scan = simulate_scan(sections, truth, scenario, 8)
+    file, profile = tmp_path / "s.npz", tmp_path / "p.json"
+    if form == "points":
+        hit = np.isfinite(scan.ranges)
+        file = tmp_path / "s.xyz"
+        np.savetxt(file, scan.origins[hit] + scan.directions[hit] * scan.ranges[hit, None], fmt="%.6f")
+    else:
+        write_scan(scan, file)
+    path = mouth_paths(joint)[0]
+    line = ",".join(f"{x:.6f}" for x in (*path.points[0], *path.points[-1]))
+    out = ",".join(f"{x:.6f}" for x in sections[0].frame.v)
+    words = ["teach", str(file), "--line", line, "--sigma", "1.5mm", "-o", str(profile)]
+    words += ["--out", out, "--spacing", "30mm"] if form == "points" else []
+    assert main(words) == 0
+    assert "along the line" in capsys.readouterr().out
+    got = read_profile(profile)
+    for which in (0, 1):
+        own = _angles(got.components[which], (got.gap.side_a, got.gap.side_b)[which])
+        true = _angles(sections[0].components[which], (sections[0].gap.side_a, sections[0].gap.side_b)[which])
+        assert own == pytest.approx(true, abs=np.radians(1.5))
+    assert np.allclose(sum(got.gap.mouth), 0.0, atol=1e-9)
+    cuts = scanned(sections, truth, scenario, 8)
+    fit = fit_joint(joint, got.applied(sections), cuts, Config(), motion="independent", threads=1)
+    assert sum(s.status.name == "ok" for s in fit.stations) > 0.8 * len(sections)
+
+
+def test_what_teach_is_asked_for_must_make_sense(tmp_path, capsys):
+    scan = tmp_path / "s.xyz"
+    scan.write_text("0 0 0\n0.1 0 0\n0 0.1 0\n" * 4)
+    profile = str(tmp_path / "p.json")
+    for words, said in (
+        ([], "--model or a --line"),
+        (["--out", "0,0,1"], "go with --line"),
+        (["--line", "0,0,0,1,0"], "wants 6 numbers"),
+        (["--line", "0,0,0,0,0,0"], "no length"),
+        (["--line", "0,0,0,1,0,0"], "sensor stood"),
+        (["--line", "0,0,0,1,0,0", "--out", "1,0,0"], "along the line"),
+        (["--line", "0,0,9,1,0,9", "--out", "0,0,1"], "slices along the line"),
+    ):
+        assert main(["teach", str(scan), *words, "-o", profile]) == 2
+        assert said in capsys.readouterr().err
+    assert not (tmp_path / "p.json").exists()
