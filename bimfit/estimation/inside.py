@@ -6,15 +6,14 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bimfit.estimation.likelihood import BeamSet, edge_rows, predict_ranges
+from bimfit.estimation import _kernels_inside as kernels
+from bimfit.estimation.likelihood import BeamSet, edge_rows
 from bimfit.estimation.result import StationEstimate
 from bimfit.geometry.joint_section import JointSection
-from bimfit.geometry.pose import Array, Pose2D
+from bimfit.geometry.pose import Pose2D
 from bimfit.geometry.status import Status
 
-Mask = NDArray[np.bool_]
 _SURE = 2.5
 _SAME = 4.0
 _FEW, _LAST = 12, 6
@@ -47,48 +46,31 @@ def returns_inside(
         pose.apply(side) for pose, side in zip(poses, (section.gap.side_a, section.gap.side_b), strict=True)
     )
     ring = np.concatenate([a, b[::-1]])
-    points = beams.points
-    low, high = ring.min(axis=0), ring.max(axis=0)
-    inside = (beams.r > 0.0) & (points >= low).all(axis=1) & (points <= high).all(axis=1)
-    if not inside.any():
+    index, ends = kernels.returns_within(ring, beams.rays, beams.r, beams.start, beams.eye)
+    if not len(index):
         return 0
-    inside[inside] = within(points[inside], ring)
-    if not inside.any():
-        return 0
-    chosen = beams.take(inside)
+    step = beam_step(beams, float(np.median(beams.r[index])), sweeps)
+    # what lies on a side itself, deep in the gap where a beam grazes it, is the component
+    clear = _SURE * np.array(spread) + step
     across = b[0] - a[0]
-    across = across / max(float(np.hypot(*across)), 1e-9)
-    step = beam_step(beams, float(np.median(chosen.r)), sweeps)
-    least = np.full(len(chosen), np.inf)
-    for pose, sd, component, sign in zip(poses, spread, section.components, (1.0, -1.0), strict=True):
-        closer = sign * (_SURE * sd + 0.5 * step) * across
-        for shift in (np.zeros(2), closer):
-            there = Pose2D(pose.u + float(shift[0]), pose.v + float(shift[1]), pose.theta)
-            least = np.minimum(least, predict_ranges(edge_rows(component, there), chosen)[0])
-    loose = least > chosen.r + _SAME * sigma
-    for side, sd in zip((a, b), spread, strict=True):
-        # what lies on a side itself, deep in the gap where a beam grazes it, is the component
-        loose &= distance_to_chain(chosen.points, side) > _SURE * sd + step
-    return int(loose.sum())
+    across = across / max(math.hypot(across[0], across[1]), 1e-9)
+    tried = np.repeat(np.array([[poses[0].as_array()], [poses[1].as_array()]]), 2, axis=1)
+    closer = _SURE * np.array(spread) + 0.5 * step
+    tried[0, 1, :2] += closer[0] * across
+    tried[1, 1, :2] -= closer[1] * across
+    rows = (edge_rows(section.components[0]), edge_rows(section.components[1]))
+    return int(kernels.loose(ends, *rows, tried, a, b, _SAME * sigma, clear))
 
 
 def beam_step(beams: BeamSet, reach: float, sweeps: int) -> float:
     """How far apart the beams of one sweep are at a distance ``reach``, m, however many sweeps interleave."""
+    if sweeps <= 1:
+        return beams.spacing * reach
     ends = np.repeat(beams.eye[:, :2], np.diff(beams.start), axis=0) + reach * beams.d.T
     middle = beams.d.mean(axis=1)
     aside = ends @ np.array([-middle[1], middle[0]]) / max(float(np.hypot(*middle)), 1e-9)
     alone = float(np.ptp(aside)) / max(len(beams) / max(sweeps, 1) - 1.0, 1.0)
-    return max(beams.spacing * reach, alone) if sweeps > 1 else beams.spacing * reach
-
-
-def within(points: Array, ring: Array) -> Mask:
-    """Which points (n, 2) a closed ring (k, 2) goes round, by the parity of crossings."""
-    p, q = ring, np.roll(ring, -1, axis=0)
-    x, y = points[:, 0, None], points[:, 1, None]
-    spans = (p[:, 1] > y) != (q[:, 1] > y)
-    rise = q[:, 1] - p[:, 1]
-    at = p[:, 0] + (y - p[:, 1]) * (q[:, 0] - p[:, 0]) / np.where(rise == 0.0, math.inf, rise)
-    return np.asarray((spans & (x < at)).sum(axis=1) % 2 == 1)
+    return max(beams.spacing * reach, alone)
 
 
 def drop_at_mouth(section: JointSection, station: StationEstimate, sigma: float) -> float:
@@ -102,16 +84,11 @@ def drop_at_mouth(section: JointSection, station: StationEstimate, sigma: float)
         if c.pose is None or len(c.residuals.places) < _FEW:
             continue
         chain = section.gap.side_a if which == 0 else section.gap.side_b
-        middles = section.components[which].edges.mean(axis=1)
-        outer = (distance_to_chain(middles, chain) > _ON_CHAIN)[c.residuals.faces]
-        if int(outer.sum()) < _FEW:
-            continue
-        z = c.residuals.residuals[outer]
-        away = c.residuals.places[outer] - c.pose.apply(chain[0])
-        order = np.argsort(np.hypot(*away.T), kind="stable")
-        last = z[order[:_LAST]]
-        best = float((np.cumsum(last) / np.sqrt(np.arange(1, len(last) + 1))).max())
-        total += best / max(sigma, 0.8 * float(z.std()))
+        r = c.residuals
+        total += kernels.drop(
+            edge_rows(section.components[which]), np.ascontiguousarray(chain, np.float64),
+            c.pose.apply(chain[0]), r.residuals, r.places, r.faces, _FEW, _LAST, _ON_CHAIN, sigma,
+        )  # fmt: skip
     return total
 
 
@@ -122,17 +99,10 @@ def place_sd(section: JointSection, station: StationEstimate) -> tuple[float, fl
         if c.pose is None or c.covariance is None:
             out.append(0.0)
             continue
-        row = np.array([1.0, 0.0, -c.pose.turn(corner)[1]])
-        out.append(math.sqrt(max(float(row @ c.covariance @ row), 0.0)))
+        lever = float(c.pose.turn(corner)[1])
+        C = c.covariance
+        out.append(math.sqrt(max(float(C[0, 0] + lever * (lever * C[2, 2] - 2.0 * C[0, 2])), 0.0)))
     return out[0], out[1]
-
-
-def distance_to_chain(points: Array, chain: Array) -> Array:
-    """Least distance of each point (n, 2) from an open chain (k, 2)."""
-    a, d = chain[:-1], np.diff(chain, axis=0)
-    t = ((points[:, None] - a) * d).sum(axis=2) / np.maximum((d * d).sum(axis=1), 1e-300)
-    near = a + np.clip(t, 0.0, 1.0)[:, :, None] * d
-    return np.asarray(np.linalg.norm(points[:, None] - near, axis=2).min(axis=1))
 
 
 def with_inside(

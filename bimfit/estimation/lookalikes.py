@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from bimfit.estimation import _kernels_inside as kernels
 from bimfit.estimation.likelihood import BeamSet
 from bimfit.estimation.result import Rival, StationEstimate
 from bimfit.geometry.joint_section import JointSection
@@ -40,20 +41,11 @@ def gap_places(section: JointSection, beams: BeamSet, pose: Pose2D) -> list[Pose
         At most four places to try.
     """
     width = float(np.hypot(*(section.gap.mouth[1] - section.gap.mouth[0])))
-    back = pose.inverse()
-    out = []
-    for g in range(len(beams.eye)):
-        k = slice(int(beams.start[g]), int(beams.start[g + 1]))
-        local = back.apply(beams.points[k])
-        at = np.flatnonzero((beams.r[k] > 0.0) & (np.abs(local[:, 1]) < _LEVEL))
-        if len(at) < 2:
-            continue
-        a, b = local[at[:-1]], local[at[1:]]
-        size = np.abs(b[:, 0] - a[:, 0])
-        hole = (np.diff(at) > _BEAMS) & (size > _NARROW * width) & (size < _WIDE * width + 0.004)
-        middle = 0.5 * (a + b)
-        for u, v in middle[hole & (np.abs(middle[:, 0]) > max(0.8 * width, 0.010))].tolist():
-            out.append(pose @ Pose2D(u, v))
+    middles = kernels.holes(
+        pose.as_array(), beams.rays, beams.r, beams.start, beams.eye,
+        _LEVEL, _BEAMS, _NARROW * width, _WIDE * width + 0.004, max(0.8 * width, 0.010),
+    )  # fmt: skip
+    out = [pose @ Pose2D(u, v) for u, v in middles.tolist()]
     out.sort(key=lambda place: math.hypot(place.u - pose.u, place.v - pose.v))
     kept: list[Pose2D] = []
     for place in out:  # several sweeps show the same gap
