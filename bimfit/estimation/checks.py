@@ -25,7 +25,7 @@ _RUN = 6
 _CUSUM = 2.3
 _CHI2 = 4.0
 _CONTINUES = 4
-_EDGE = 3.5
+_EDGE = 4.2
 _BY_CHANCE = 0.05
 _FIXED_BY_HITS = 0.001
 _TURNED = 3.0
@@ -110,7 +110,8 @@ def _component_status(
     moved = float(np.hypot(*(posterior.pose.apply(prior.inverse().apply(pivot)) - pivot)))
     turned = abs(posterior.pose.theta - prior.theta)
     if r.n_inliers < fit.min_points:
-        return Status("rejected", f"only {r.n_inliers} returns lie on the component"), ""
+        lie = "return lies" if r.n_inliers == 1 else "returns lie"
+        return Status("rejected", f"only {r.n_inliers} {lie} on the component"), ""
     if r.n_inliers < _INLIERS * r.n_covered:
         share = f"{r.n_inliers} of the {r.n_covered} beams that should meet the component"
         return Status("rejected", f"only {share} return from it"), ""
@@ -173,7 +174,8 @@ def _joint_status(
     # a gap that would be far narrower than designed is the more likely one that chance misses have made
     doubt = _BY_CHANCE if widened > -0.5 * float(np.hypot(*designed)) else 0.1 * _BY_CHANCE
     if passed and covered * max(sensor.miss_share, 1e-3) ** passed > doubt:
-        return Status("weak", f"only {passed} beams pass between the components: they may be drop-outs")
+        beams_pass = "1 beam passes" if passed == 1 else f"{passed} beams pass"
+        return Status("weak", f"only {beams_pass} between the components: too few to tell from drop-outs")
     return OK
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from bimfit.estimation import _kernels_inside as kernels
+from bimfit.estimation.cut_edges import Reshape, odds_of_cut_edges
 from bimfit.estimation.likelihood import BeamSet, edge_rows
 from bimfit.estimation.result import StationEstimate
 from bimfit.geometry.joint_section import JointSection
@@ -18,8 +19,10 @@ _SURE = 2.5
 _SAME = 4.0
 _FEW, _LAST = 12, 6
 _ON_CHAIN = 1e-6
-_DROP = (4.2, 1.0, 0.0, -math.inf)
-"""Greatest drop at the mouth with no return inside the gap, with one, two and more."""
+_SUSPICIOUS = 1.8
+"""A drop at the mouth that large, of both sides together, is worth the test of cut edges."""
+_ODDS = (4.0, 1.0, 0.0, -math.inf)
+"""Greatest log-odds of cut edges with no return inside the gap, with one, two and more."""
 
 
 def returns_inside(
@@ -106,21 +109,34 @@ def place_sd(section: JointSection, station: StationEstimate) -> tuple[float, fl
 
 
 def with_inside(
-    station: StationEstimate, section: JointSection, beams: BeamSet, sigma: float, sweeps: int
+    station: StationEstimate,
+    section: JointSection,
+    beams: BeamSet,
+    sigma: float,
+    sweeps: int,
+    reshape: Reshape,
 ) -> StationEstimate:
-    """The station, ``rejected`` where something is inside the gap or its edges are not as designed."""
+    """The station, ``rejected`` where something is inside the gap or its edges are not as designed.
+
+    Parameters
+    ----------
+    reshape : callable
+        Tries other shapes of a component on the slice; called only where its edges look suspicious.
+    """
     a, b = (c.pose for c in station.components)
     if a is None or b is None or not station.status.measured:
         return station
-    drop = drop_at_mouth(section, station, sigma)
     count = returns_inside(section, beams, (a, b), place_sd(section, station), sigma, sweeps)
     inside = math.ceil(count / max(sweeps, 1))
-    most = _DROP[min(inside, len(_DROP) - 1)]
-    if drop <= most:
+    most = _ODDS[min(inside, len(_ODDS) - 1)]
+    if not inside and drop_at_mouth(section, station, sigma) < _SUSPICIOUS:
+        return station
+    if math.isfinite(most) and odds_of_cut_edges(section, reshape) <= most:
         return station
     reason = (
-        "the components' edges at the mouth are not shaped as designed: their surfaces drop off before them"
+        "the edges at the mouth are not shaped as designed: a bevel or a chamfer explains the returns better"
     )
     if inside:
-        reason = f"{count} returns come from inside the gap, where the design has nothing"
+        returns = "return comes" if count == 1 else "returns come"
+        reason = f"{count} {returns} from inside the gap, where the design has nothing"
     return replace(station, status=Status("rejected", reason))

@@ -147,7 +147,7 @@ def _estimated(
     growth = context.sensor.sigma / sensor.pooled().sigma
     beams, sensor = context.beams, context.sensor
     best, cost = _placed(context, slice_, combined, component_matches, rivals, reason)
-    best = with_inside(best, section, beams, sensor.sigma, slice_.sweeps)
+    best = _with_inside(context, slice_, best)
     best = dataclasses.replace(best, growth=growth)
     if not best.status.measured or best.combined is None:
         return best
@@ -155,7 +155,7 @@ def _estimated(
     for place in gap_places(section, beams, best.combined):
         there = best_start(section, beams, cost, (place,), sensor, fit)
         other = _components(context, slice_, there, cost, (None, None), reason)
-        other = with_inside(other, section, beams, sensor.sigma, slice_.sweeps)
+        other = _with_inside(context, slice_, other)
         others.append(dataclasses.replace(other, growth=growth))
     return with_lookalikes(best, others, fit.joint_sigma)
 
@@ -203,6 +203,28 @@ def reshaped(
     if pose is None or station.components[which].pose is None:
         return [None] * len(profiles)
     context, _ = _context(section, slice_, pose, sensor, fit)
+    return _reshaped(context, station, pose, which, profiles, None)
+
+
+def _with_inside(context: _Context, slice_: Slice, station: StationEstimate) -> StationEstimate:
+    """The station, judged by what is inside its gap and by the edges of its mouth."""
+
+    def reshape(which: int, profiles: Sequence[Profile], begin: Pose2D | None) -> list[Posterior | None]:
+        assert station.combined is not None
+        return _reshaped(context, station, station.combined, which, profiles, begin)
+
+    sigma = context.sensor.sigma
+    return with_inside(station, context.section, context.beams, sigma, slice_.sweeps, reshape)
+
+
+def _reshaped(
+    context: _Context,
+    station: StationEstimate,
+    pose: Pose2D,
+    which: int,
+    profiles: Sequence[Profile],
+    begin: Pose2D | None,
+) -> list[Posterior | None]:
     beams = context.beams
     scene = _scene(context, (pose, pose))
     side = split_side(scene, beams, np.array([pose.u, pose.v]))
@@ -215,7 +237,7 @@ def reshaped(
     use, spent = second_round(
         which, scene, side, beams, cost, context.model, territory=shallow & (passed > 0)
     )
-    window, begin = _window(context), station.components[which].pose
+    window, begin = _window(context), begin or station.components[which].pose
     return [
         component_posterior(
             edge_rows(profile), pose, beams, spent, context.model, window, use=use & usable, begin=begin
