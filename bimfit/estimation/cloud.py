@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bimfit.config import SensorConfig
-from bimfit.estimation.likelihood import usual_step
 from bimfit.geometry.pose import Array, Pose2D
 from bimfit.geometry.slice import Beams, Slice
 
@@ -19,6 +18,7 @@ _REGULAR = 0.2
 _FAN = 0.12
 """So regular are the bearings from where a sensor stood; a few points at random may come to 0.2."""
 _MOST = 400
+_OWN_HOLES = 2
 _WINDOW = 6.0
 _CLIP = 3.0
 _LOOKS = 12
@@ -58,12 +58,12 @@ def virtual_beams(slice_: Slice, combined: Pose2D) -> VirtualBeams:
         eye = centre + combined.turn((0.0, _ASSUMED_DISTANCE)) if found is None else found
     b, r = _bearings(points, eye, centre)
     step = np.diff(b)
-    local = np.maximum(_local_step(b, step), 1e-9)
+    local, rows = (np.maximum(x, 1e-9) for x in _local_steps(b, step))
     regular = _irregularity(step) < _REGULAR
     # among points at random, half of the length lies in steps of at least 1.7 of their mean
     fill = local if regular else 0.5 * local
     bearings, ranges = [b], [r]
-    for i in np.flatnonzero(step > _HOLE * local):
+    for i in np.flatnonzero(step > _HOLE * rows):
         n = min(max(round(step[i] / fill[i]) - 1, 1), _MOST)
         bearings.append(b[i] + step[i] * np.arange(1, n + 1) / (n + 1))
         ranges.append(np.full(n, np.nan))
@@ -93,12 +93,22 @@ def _bearings(points: Array, eye: Array, centre: Array) -> tuple[Array, Array]:
     return b[order], np.linalg.norm(d, axis=1)[order]
 
 
+def _row_step(step: Array) -> float:
+    """The step from row to row: three quarters of the length, a gap's holes apart, lie in no greater ones.
+
+    Several rows that all but coincide leave small steps between them, however many, and those are no rows.
+    """
+    ordered = np.sort(step)[: max(len(step) - _OWN_HOLES, min(len(step), 1))]
+    length = np.cumsum(ordered)
+    return float(ordered[np.searchsorted(length, 0.75 * length[-1])]) if len(ordered) else 0.0
+
+
 def _irregularity(step: Array) -> float:
     """Mean over the length of min(|step / usual - 1|, 1/2): 0 for an even fan, about 0.4 at random.
 
     Steps count by their length, so that several rows whose points nearly coincide are as regular as one.
     """
-    usual = usual_step(step)
+    usual = _row_step(step)
     if len(step) < 8 or usual <= 0.0:
         return 0.5
     return float(np.minimum(np.abs(step / usual - 1.0), 0.5) @ step / step.sum())
@@ -142,17 +152,26 @@ def recovered_viewpoint(slices: Sequence[Array], combined: Pose2D) -> Array | No
     return place(best[1], best[2]) if best[0] < _FAN else None
 
 
-def _local_step(b: Array, step: Array) -> Array:
-    """The usual step about each, without itself: it may be the hole that is being judged."""
-    usual = usual_step(step)
+def _local_steps(b: Array, step: Array) -> tuple[Array, Array]:
+    """The usual step about each and the usual step from row to row, each without itself: it may be a hole.
+
+    Means of the steps, weighted by the length that they take and by its square. Over an even fan both are its
+    step; where several rows all but coincide, the second is hardly less than the way to the next such group.
+    """
+    usual = _row_step(step)
     if len(step) < 3 or usual <= 0.0:
-        return step
+        return step, step
     kept = np.minimum(step, _CLIP * usual)
-    sums = np.concatenate([[0.0], np.cumsum(kept)])
-    squares = np.concatenate([[0.0], np.cumsum(kept * kept)])
     low = np.searchsorted(b, b[:-1] - _WINDOW * usual)
     high = np.searchsorted(b, b[1:] + _WINDOW * usual, side="right") - 1
-    length = sums[high] - sums[low] - kept
-    return np.where(
-        length > usual, (squares[high] - squares[low] - kept * kept) / np.maximum(length, 1e-12), usual
+
+    def around(values: Array) -> Array:
+        sums = np.concatenate([[0.0], np.cumsum(values)])
+        return np.asarray(sums[high] - sums[low] - values)
+
+    length, squares, cubes = around(kept), around(kept**2), around(kept**3)
+    enough = length > usual
+    return (
+        np.where(enough, squares / np.maximum(length, 1e-12), usual),
+        np.where(enough, cubes / np.maximum(squares, 1e-24), usual),
     )

@@ -406,12 +406,13 @@ def _corner_step(context: _Context, which: int, pose: Pose2D) -> float:
     """Bearing of a mouth corner from the first sensor position, in beam steps.
 
     Counted from the middle of the beams, which is fixed to the sensor; beams made up from points have no
-    middle of their own and are counted from straight into the mouth.
+    middle of their own and are counted from the designed mouth. Not from farther off: the steps differ a
+    little from slice to slice, and so many of them would hide that two slices see a corner in the same place.
     """
     if context.beams.spacing <= 0.0:
         return math.nan
     x, y = pose.apply(context.section.gap.mouth[which]) - context.beams.eye[0, :2]
-    lx, ly = (0.0, -1.0) if context.virtual else context.beams.eye[0, 2:]
+    lx, ly = -context.beams.eye[0, :2] if context.virtual else context.beams.eye[0, 2:]
     return math.atan2(lx * y - ly * x, lx * x + ly * y) / context.beams.spacing
 
 
