@@ -43,6 +43,7 @@ _FEW_THROUGH = 3
 _UNKNOWN_RANGE = 1.0
 _FAR_ALONG = 0.025
 _WORTH_A_LOOK = -15.0
+_LOOSE = 5.0
 
 
 @dataclass(frozen=True)
@@ -203,7 +204,10 @@ def reshaped(
     if pose is None or station.components[which].pose is None:
         return [None] * len(profiles)
     context, _ = _context(section, slice_, pose, sensor, fit)
-    return _reshaped(context, station, pose, which, profiles, None)
+    window = _window(context)
+    # the combined pose was found with another shape, for which a prior about it would speak at every station
+    window = dataclasses.replace(window, shift=_LOOSE * window.shift, angle=_LOOSE * window.angle)
+    return _reshaped(context, station, pose, which, profiles, None, window)
 
 
 def _with_inside(context: _Context, slice_: Slice, station: StationEstimate) -> StationEstimate:
@@ -211,7 +215,7 @@ def _with_inside(context: _Context, slice_: Slice, station: StationEstimate) -> 
 
     def reshape(which: int, profiles: Sequence[Profile], begin: Pose2D | None) -> list[Posterior | None]:
         assert station.combined is not None
-        return _reshaped(context, station, station.combined, which, profiles, begin)
+        return _reshaped(context, station, station.combined, which, profiles, begin, _window(context))
 
     sigma = context.sensor.sigma
     return with_inside(station, context.section, context.beams, sigma, slice_.sweeps, reshape)
@@ -224,6 +228,7 @@ def _reshaped(
     which: int,
     profiles: Sequence[Profile],
     begin: Pose2D | None,
+    window: Window,
 ) -> list[Posterior | None]:
     beams = context.beams
     scene = _scene(context, (pose, pose))
@@ -237,7 +242,7 @@ def _reshaped(
     use, spent = second_round(
         which, scene, side, beams, cost, context.model, territory=shallow & (passed > 0)
     )
-    window, begin = _window(context), begin or station.components[which].pose
+    begin = begin or station.components[which].pose
     return [
         component_posterior(
             edge_rows(profile), pose, beams, spent, context.model, window, use=use & usable, begin=begin

@@ -35,6 +35,7 @@ def _joint(sensor, n=25, **scan):
     [
         ({}, 0.003, 0.0, 0.01, 0.01),
         ({"sigma": 0.0045}, 0.0045, 0.0, 0.01, 0.01),
+        ({"sigma": 0.001}, 0.001, 0.0, 0.01, 0.01),
         ({"rho": 0.5}, 0.003, 0.5, 0.01, 0.01),
         ({"misses": 0.05, "outliers": 0.05}, 0.003, 0.0, 0.05, 0.05),
     ],
@@ -49,6 +50,13 @@ def test_what_was_simulated_comes_back(scan, sigma, rho, miss, outlier):
     assert noise.sensor.pooled().sigma == pytest.approx(
         noise.sigma * np.sqrt((1 + noise.correlation) / (1 - noise.correlation))
     )
+
+
+def test_one_station_says_what_it_can():
+    for sigma in (0.0015, 0.003, 0.006):
+        noise = estimate_noise(_joint(SensorConfig(), n=1, sigma=sigma), SensorConfig())
+        assert noise.sigma == pytest.approx(sigma, rel=0.2)
+        assert noise.correlation == 0.0
 
 
 def test_too_few_residuals_change_nothing():

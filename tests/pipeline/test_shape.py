@@ -82,6 +82,25 @@ def test_freed_bevels_are_found_and_the_gap_is_measured_with_them(scene):
     assert row["a_thickness_m"] == ""
 
 
+def test_outer_faces_that_lean_the_same_way_are_not_taken_for_a_turn_of_the_joint():
+    model, found = model_joints(sample_model("v-groove.ifc"), Config().joints)
+    joint = longest_open(found)
+    scenario = Scenario(spacing=0.05)
+    sections = designed(model, joint, scenario)
+    leaning = (math.radians(4.0), math.radians(-4.0))
+    real = tuple(
+        deformed(deformed(s, 0, {"face-angle": leaning[0]}), 1, {"face-angle": leaning[1]}) for s in sections
+    )
+    truth = random_truth(sections, scenario, 43000, joint_id=joint.id, elements=joint.elements)
+    slices = scanned(real, truth, scenario, 43000)
+    free = dataclasses.replace(Config(), shape=ShapeConfig(face_angle=math.radians(2.0)))
+    fit = fit_joint(joint, sections, slices, free, motion="independent", threads=1)
+    for component, wanted in zip(fit.stations[8].components, leaning, strict=True):
+        (face,) = component.shape
+        assert face.state == "estimated"
+        assert abs(face.value - wanted) < 2.5 * face.sigma < math.radians(2.5)
+
+
 def test_a_freedom_at_its_limit_is_weak_and_says_so(scene):
     joint, sections, _, _, slices = scene
     sensor = dataclasses.replace(Config().sensor, sigma=0.001)
