@@ -12,8 +12,12 @@ from bimfit.geometry.status import Status
 
 _SURE = 4.0
 """Standard deviations from which on pooled residuals are no accident."""
+_BENT = 3.5
+"""The same for a bend, which is one figure a component and not the best of many."""
 _MATTERS = 0.06
 """A shape matters where it departs from the design by this share of sigma, however sure it is."""
+_BEND_MATTERS = 0.04
+"""A bend, by this: what shows of one is what no turn of the component takes up."""
 _NEIGHBOURS, _MOSTLY = 6, 0.6
 
 
@@ -30,8 +34,8 @@ def with_company(
         Of neighbouring beams' noise.
     """
     departures = [departure(stations, sections, which, correlation=correlation) for which in (0, 1)]
-    least = _MATTERS * min((e.sensor.sigma for e in stations), default=0.0)
-    reasons = [_reason(d) if d.rms > least else "" for d in departures]
+    sigma = min((e.sensor.sigma for e in stations), default=0.0)
+    reasons = [_reason(d) if d.rms > _least(d) * sigma else "" for d in departures]
     rejected = [e.status.name == "rejected" for e in stations]
     out = []
     for i, station in enumerate(stations):
@@ -47,15 +51,26 @@ def with_company(
     return tuple(out)
 
 
-def departs(found: Departure) -> bool:
-    """Whether a component's shape is another than designed, by its residuals pooled along the joint."""
-    return found.freedom > 0 and (abs(found.bow) > _SURE or found.score > _SURE)
+def departs(found: Departure, bent: float = _SURE) -> bool:
+    """Whether a component's shape is another than designed, by its residuals pooled along the joint.
+
+    Parameters
+    ----------
+    bent : float
+        From how many standard deviations on a bend is no accident.
+    """
+    return found.freedom > 0 and (abs(found.bow) > bent or found.score > _SURE)
+
+
+def _least(found: Departure) -> float:
+    """Share of sigma from which on a departure matters."""
+    return _BEND_MATTERS if abs(found.bow) > _BENT else _MATTERS
 
 
 def _reason(found: Departure) -> str:
-    if not departs(found):
+    if not departs(found, _BENT):
         return ""
-    what = "bent" if abs(found.bow) > _SURE else "of another shape"
+    what = "bent" if abs(found.bow) > _BENT else "of another shape"
     return (
         f"pooled along the joint, its surface is {what}: up to {abs(found.worst) * 1e3:.1f} mm "
         f"{'in front of' if found.worst > 0.0 else 'behind'} the designed one"
