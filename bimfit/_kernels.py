@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numba as nb
+from numba.core import event
 
 
 def jit(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -48,3 +50,22 @@ def _compiled(function: Callable[..., Any], **more: bool | set[str]) -> Callable
     except RuntimeError:  # numba found no directory for its cache: a read-only installation
         compiled = nb.njit(**options)(function)
     return compiled
+
+
+@contextmanager
+def compiling(tell: Callable[[], None]) -> Iterator[None]:
+    """Call ``tell`` whenever a kernel has to be compiled because no earlier run left it in the cache."""
+
+    class Listener(event.Listener):  # type: ignore[misc]
+        def on_start(self, _: event.Event) -> None:
+            tell()
+
+        def on_end(self, _: event.Event) -> None:
+            pass
+
+    listener = Listener()
+    event.register("numba:compile", listener)
+    try:
+        yield
+    finally:
+        event.unregister("numba:compile", listener)
