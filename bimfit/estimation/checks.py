@@ -89,7 +89,7 @@ def _component(
 ) -> ComponentEstimate:  # fmt: skip
     if posterior is None:
         return ComponentEstimate(status=Status("no_data", "hardly any return lies on the component"))
-    status, weak = _component_status(posterior, residuals, prior, window, fit, sensor.miss_share)
+    status, weak = _component_status(posterior, residuals, prior, window, fit, sensor)
     rivals: tuple[Rival, ...] = ()
     if posterior.rival_mass > _WORTH_NAMING:
         du, dv = posterior.rival_offset * posterior.weak_axis[:2]
@@ -103,7 +103,7 @@ def _component(
 
 
 def _component_status(
-    posterior: Posterior, r: Residuals, prior: Pose2D, window: Window, fit: FitConfig, miss_share: float
+    posterior: Posterior, r: Residuals, prior: Pose2D, window: Window, fit: FitConfig, sensor: SensorConfig
 ) -> tuple[Status, str]:
     """Verdict on one component, and the name of its weak direction."""
     pivot = posterior.pivot
@@ -115,9 +115,10 @@ def _component_status(
     if r.n_inliers < _INLIERS * r.n_covered:
         share = f"{r.n_inliers} of the {r.n_covered} beams that should meet the component"
         return Status("rejected", f"only {share} return from it"), ""
-    # the longest run of chance misses among so many beams is seldom longer than this
-    chance = math.log(1e-3 / max(r.n_covered, 1)) / math.log(max(miss_share, 0.05))
-    if max(r.miss_run, r.outlier_run) >= max(_RUN, chance):
+    # the longest run by chance among so many beams is seldom longer than this
+    rare = math.log(1e-3 / max(r.n_covered, 1))
+    lost, strayed = (rare / math.log(max(share, 0.05)) for share in (sensor.miss_share, sensor.outlier_share))
+    if r.miss_run >= max(_RUN, lost) or r.outlier_run >= max(_RUN, strayed):
         what = "return nothing" if r.miss_run >= r.outlier_run else "return from elsewhere"
         run = max(r.miss_run, r.outlier_run)
         return Status("rejected", f"{run} beams in a row that should meet the component {what}"), ""
