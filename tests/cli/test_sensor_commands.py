@@ -10,6 +10,7 @@ import struct
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -57,9 +58,21 @@ def emulated(tmp_path_factory):
 
     A fault's time counts from the first scan on.
     """
-    folder = tmp_path_factory.mktemp("emulate")
     faults = ["--fault", "bad_sum@0.7", "--fault", "garbage@1.2", "--fault", "dropped_byte@1.9"]
-    process = bimfit("emulate", "--seed", 11, "--truth", folder / "truth.json", *faults)
+    with emulating(tmp_path_factory.mktemp("emulate"), *faults) as running:
+        yield running
+
+
+@pytest.fixture
+def sound(tmp_path):
+    """The same without faults, still where it starts."""
+    with emulating(tmp_path) as running:
+        yield running
+
+
+@contextmanager
+def emulating(folder, *more):
+    process = bimfit("emulate", "--seed", 11, "--truth", folder / "truth.json", *more)
     port = process.stdout.readline().rstrip("\n")
     (truth,) = read_truth(folder / "truth.json")
     assert process.stderr.readline().startswith(f"serves joint {truth.id} of {SAMPLE}")
@@ -102,9 +115,8 @@ def test_live_measures_what_is_true_while_things_go_wrong(emulated, samples, cap
     assert np.mean(np.abs(errors) < 3.0 * sigmas) > 0.9
 
 
-def test_what_was_captured_replays_alike(emulated, samples, tmp_path, capsys):
-    port, truth, start = emulated
-    time.sleep(3.2)  # the emulated sensor is back at the joint's start
+def test_what_was_captured_replays_alike(sound, samples, tmp_path, capsys):
+    port, truth, start = sound
     scan = tmp_path / "scan.npz"
     assert main(["capture", "--port", port, "--sweeps", "12", "--field", "30deg", "-o", str(scan)]) == 0
     assert capsys.readouterr().out == f"12 sweeps, {12 * 171} beams: {scan}\n"
