@@ -65,9 +65,11 @@ def bench_space(joints: int, seed: int, progress: Progress) -> Bench:
     return Bench("\n".join([f"tables: {said}", _head(rows[0]), *(_line(row) for row in rows)]), data)
 
 
-def reference_joints(joints: int, seed: int) -> Iterator[tuple[JointTruth, Cut]]:
-    """Truth and cut of so many seeded joints of the reference scenario."""
-    scenario = Scenario()
+def reference_joints(
+    joints: int, seed: int, scenario: Scenario | None = None
+) -> Iterator[tuple[JointTruth, Cut]]:
+    """Truth and cut of so many seeded joints of the reference scenario, or of another."""
+    scenario = scenario or Scenario()
     model, found = model_joints(sample_model(REFERENCE), Config().joints)
     joint = longest_open(found)
     sections = designed(model, joint, scenario)

@@ -23,12 +23,16 @@ from bimfit.registration.bench import (
     table_figures,
 )
 from bimfit.registration.table import Target
+from bimfit.simulation.scenario import Scenario
 
 MOST_JOINTS = 3
 """Joints of 83 slices each: 249 slices, and about two minutes on an idle core."""
 BLURS = (0.006, 0.003)
 COMPONENT = (0.0125, 0.0125, math.radians(6.0))
 GROWTH_SLICES, EXACT_SLICES = 83, 50
+STARTS = ((0.002, 0.5), (0.010, 2.5), (0.020, 5.0), (0.060, 20.0))
+"""How far off local methods start at most: m, degrees."""
+DOWNHILL = ("icp-point", "icp-plane", "icp-plane-robust", "icp-multistart", "grcsm")
 SLOW = {"brute": 5, "mrcsm": 83}
 
 
@@ -63,6 +67,7 @@ def bench_matcher(joints: int, seed: int, progress: Callable[[str, float], None]
         grown = Target.of(both, blur)
         rows += _named(f"growth, {mm}", bench_growth(grown, slices[:GROWTH_SLICES], search))
         tables += [{"of": f"growth, {mm}", **figures} for figures in table_figures(grown)]
+    rows += _by_start(seed)
     asked = _asked(rows, exact, threads, tables)
     data = {
         "slices": len(slices), "rows": [dataclasses.asdict(row) for row in rows], "exactness": exact,
@@ -71,12 +76,30 @@ def bench_matcher(joints: int, seed: int, progress: Callable[[str, float], None]
     return Bench(_text(len(slices), data), data)
 
 
-def _scene(joints: int, seed: int) -> tuple[list[Slice], list[Pose2D], tuple[Array, ...]]:
+def _by_start(seed: int) -> list[BenchRow]:
+    """Local methods by the size of the initial error, on boards moved as one (METHOD, section 7).
+
+    Starts are drawn uniformly about the truth, an axis each; the search starts at the designed pose.
+    """
+    slices, truth, edges = _scene(1, seed, Scenario(own_shift=(0.0, 0.0), own_angle=0.0))
+    target, rng = Target.of(np.concatenate(edges), BLURS[0]), np.random.default_rng(seed)
+    rows: list[BenchRow] = []
+    for shift, angle in STARTS:
+        drawn = rng.uniform(-1.0, 1.0, (len(truth), 3)) * (shift, shift, math.radians(angle))
+        starts = [Pose2D(p.u + d[0], p.v + d[1], p.theta + d[2]) for p, d in zip(truth, drawn, strict=True)]
+        found = bench_methods(target, slices, SearchConfig(), DOWNHILL, starts=starts, truth=truth)
+        rows += _named(f"start off {shift * 1e3:g} mm, {angle:g}", found)
+    return rows
+
+
+def _scene(
+    joints: int, seed: int, scenario: Scenario | None = None
+) -> tuple[list[Slice], list[Pose2D], tuple[Array, ...]]:
     """Slices, true common poses and each component's visible edges."""
     slices: list[Slice] = []
     truth: list[Pose2D] = []
     edges: tuple[Array, ...] = ()
-    for joint_truth, (_, sections, cut) in reference_joints(joints, seed):
+    for joint_truth, (_, sections, cut) in reference_joints(joints, seed, scenario):
         edges = edges or matched_edges(sections[0], expected_viewpoint(cut[0], sections[0]), Config())
         slices += list(cut)
         truth += [station.common or Pose2D() for station in joint_truth.stations]

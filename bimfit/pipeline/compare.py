@@ -7,6 +7,7 @@ import dataclasses
 import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,16 +16,17 @@ import numpy as np
 from bimfit.config import Config
 from bimfit.errors import ConfigError, ScanError
 from bimfit.files import protect_inputs, write_text
+from bimfit.gap.section import gap_section
 from bimfit.geometry.joint_section import JointSection
-from bimfit.geometry.pose import Array
+from bimfit.geometry.pose import Array, Pose2D
 from bimfit.geometry.slice import Slice
-from bimfit.pipeline.accuracy import joint_errors
+from bimfit.pipeline.accuracy import gap_estimate, joint_errors
 from bimfit.pipeline.fit import METHODS, check_choice, fit_joint
 from bimfit.pipeline.placing import Placing
 from bimfit.pipeline.records import JointResult
 from bimfit.pipeline.results import to_json
 from bimfit.report.tables import MethodOutcome, plot_comparison
-from bimfit.simulation.accuracy import truth_for
+from bimfit.simulation.accuracy import gap_errors, truth_for
 from bimfit.simulation.truth import JointTruth, read_truth
 
 if TYPE_CHECKING:
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
 
 DEFAULT_METHODS = ("grcsm", "search", "paper", "mrcsm", "icp-point", "icp-plane")
 LOST = 0.010
+STARTS = (-1.0, 0.005, 0.015, 0.030, np.inf)
 Progress = Callable[[str, float], None]
 
 
@@ -52,6 +55,8 @@ class MethodResult:
         Wall time a slice.
     evaluations : ndarray, shape (n,)
         Of the combined search; 0 where a method has none.
+    initial : ndarray, shape (n,)
+        How far the designed pose, which every method starts from, was off, m; NaN where nobody knows.
     """
 
     method: str
@@ -59,6 +64,7 @@ class MethodResult:
     angles: Array
     seconds: Array
     evaluations: Array
+    initial: Array
 
     def summary(self) -> dict[str, Any]:
         """The figures of the table."""
@@ -78,6 +84,22 @@ class MethodResult:
             "p95_ms": float(np.percentile(self.seconds, 95) * 1e3),
             "median_evaluations": float(np.median(self.evaluations)),
         }
+
+    def by_start(self) -> tuple[dict[str, Any], ...]:
+        """Share of slices lost or over 10 mm off, by how far the designed pose was off."""
+        lost = ~(self.errors <= LOST)
+        rows = []
+        for low, high in pairwise(STARTS):
+            here = (self.initial > low) & (self.initial <= high)
+            count = int(here.sum())
+            rows.append(
+                {
+                    "over_mm": low * 1e3, "to_mm": high * 1e3, "slices": count,
+                    "lost_share": float(lost[here].mean()) if count else float("nan"),
+                    "median_ms": float(np.median(self.seconds[here]) * 1e3) if count else float("nan"),
+                }
+            )  # fmt: skip
+        return tuple(rows)
 
 
 @dataclass(frozen=True)
@@ -163,14 +185,27 @@ def run_methods(
 def _method_result(
     method: str, results: Sequence[JointResult], first: Sequence[JointResult], truths: Sequence[JointTruth]
 ) -> MethodResult:
-    errors, angles = [], []
+    errors, angles, initial = [], [], []
     for result, reference in zip(results, first, strict=True):
         truth = truth_for(result.joint.elements, truths)
+        designed = [
+            gap_section(s.section.s, s.section.frame, s.section.gap, Pose2D(), Pose2D())
+            for s in result.stations
+        ]
         if truth is not None:
+            initial.append(gap_errors([gap_estimate(gap) for gap in designed], truth).position)
             against = joint_errors(result, truth)
             errors.append(against.position)
             angles.append(against.angle)
         else:
+            initial.append(
+                np.array(
+                    [
+                        np.nan if b.gap is None else float(np.hypot(*(a.origin - b.gap.origin)))
+                        for a, b in zip(designed, reference.stations, strict=True)
+                    ]
+                )
+            )
             pairs = zip(result.stations, reference.stations, strict=True)
             rows = [
                 (np.nan, np.nan)
@@ -188,6 +223,7 @@ def _method_result(
         np.concatenate(angles),
         np.array([station.seconds for station in stations]),
         np.array(evaluations, float),
+        np.concatenate(initial),
     )
 
 
@@ -219,9 +255,23 @@ def comparison_table(comparison: Comparison) -> str:
             f"{f['max_mm']:8.2f}{f['mean_angle_deg']:9.2f}{f['median_ms']:9.2f}{f['p95_ms']:9.2f}"
             f"{f['median_evaluations']:13.0f}"
         )
+    lines += _by_start(comparison.methods)
     return "\n".join(
         [*lines, f"errors of the gap's origin against the {comparison.reference}; times a slice, one thread"]
     )
+
+
+def _by_start(methods: Sequence[MethodResult]) -> list[str]:
+    """Shares lost or over 10 mm off, a column for each size of the designed pose's error."""
+    used = [k for k, row in enumerate(methods[0].by_start()) if row["slices"]]
+    head = f"{'lost or >10 mm, designed pose off by':38}"
+    lines = []
+    for result in methods:
+        rows = [result.by_start()[k] for k in used]
+        shares = "".join(f"{100.0 * row['lost_share']:15.1f}%" for row in rows)
+        lines.append(f"{result.method:38}{shares}")
+        sizes = [f"{max(row['over_mm'], 0.0):g}..{row['to_mm']:g} mm ({row['slices']})" for row in rows]
+    return [head + "".join(f"{size:>16}" for size in sizes), *lines] if used else []
 
 
 def write_comparison(comparison: Comparison, folder: Path) -> tuple[Path, ...]:
@@ -235,6 +285,7 @@ def write_comparison(comparison: Comparison, folder: Path) -> tuple[Path, ...]:
     paths = tuple(folder / name for name in ("compare.csv", "compare.json", "compare.png"))
     protect_inputs(paths, comparison.inputs)
     rows = [result.summary() for result in comparison.methods]
+    starts = {result.method: result.by_start() for result in comparison.methods}
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
@@ -245,7 +296,16 @@ def write_comparison(comparison: Comparison, folder: Path) -> tuple[Path, ...]:
         for result in comparison.methods
     }
     write_text(
-        paths[1], to_json({"schema": 1, "reference": comparison.reference, "methods": rows, "slices": slices})
+        paths[1],
+        to_json(
+            {
+                "schema": 1,
+                "reference": comparison.reference,
+                "methods": rows,
+                "by_start": starts,
+                "slices": slices,
+            }
+        ),
     )
     plot_comparison(
         paths[2], {r.method: MethodOutcome(r.errors, r.seconds) for r in comparison.methods}, lost=LOST

@@ -37,7 +37,8 @@ from bimfit.pipeline.targets import (
     matched_slice,
     prepare,
 )
-from bimfit.registration.matchers import MATCHERS
+from bimfit.registration.fitness import own_returns
+from bimfit.registration.matchers import LOCAL, MATCHERS
 from bimfit.registration.result import MatchResult
 
 if TYPE_CHECKING:
@@ -211,7 +212,16 @@ def fit_station(
     components: tuple[MatchResult, MatchResult] | None = None
     if combined.found:
         search = economic(component_search(section, config), targets.stations, COMPONENT_BREAK_EVEN)
-        a, b = (match(target, near, combined.pose, search) for target in targets.components)
+        shares = (near, near)
+        if method in LOCAL:
+            first, second = own_returns(targets.components, near.points, combined.pose)
+            shares = (
+                dataclasses.replace(near, points=near.points[first], beams=None),
+                dataclasses.replace(near, points=near.points[second], beams=None),
+            )
+        a, b = (
+            match(t, own, combined.pose, search) for t, own in zip(targets.components, shares, strict=True)
+        )
         components = (a, b)
     fit = StationFit(section, slice_, combined, components, None, 0.0)
     if method == "grcsm":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,6 +12,22 @@ from bimfit.registration import _kernels
 from bimfit.registration.table import Target
 
 INLIER_SIGMAS = 3.0
+
+
+def distances_to(target: Target, points: Array, pose: Pose2D) -> Array:
+    """Distance of each point from the moved model's surface, m; inf where none of it is visible."""
+    own = pose.inverse().apply(points)[:, None]
+    a, along = target.edges[:, 0], target.edges[:, 1] - target.edges[:, 0]
+    length = np.maximum(np.sum(along**2, axis=1), 1e-300)
+    share = np.clip(np.sum((own - a) * along, axis=2) / length, 0.0, 1.0)
+    off = np.linalg.norm(own - a - share[..., None] * along, axis=2)
+    return np.asarray(np.min(off, axis=1, initial=np.inf))
+
+
+def own_returns(targets: Sequence[Target], points: Array, pose: Pose2D) -> tuple[Array, ...]:
+    """Which points are whose, as one mask a model: those nearest to it while all are moved by ``pose``."""
+    nearest = np.argmin([distances_to(target, points, pose) for target in targets], axis=0)
+    return tuple(nearest == k for k in range(len(targets)))
 
 
 def fitness_of(target: Target, points: Array, pose: Pose2D) -> tuple[float, float]:

@@ -265,6 +265,9 @@ def _result(
     )  # fmt: skip
 
 
+LOCAL = ("icp-point", "icp-plane", "icp-plane-robust", "icp-multistart", "g-icp")
+"""Matchers that go downhill from the prior: a component is given its own returns, or another's mislead it."""
+
 MATCHERS: dict[str, Matcher] = {
     "grcsm": match,
     "overlap": match_overlap,

@@ -237,6 +237,9 @@ def test_compare_writes_its_table(model, scan, tmp_path, capsys):
     assert rows["grcsm"]["mean_mm"] < 0.8
     assert rows["grcsm"]["over_10_mm"] == 0
     assert rows["mrcsm"]["median_evaluations"] > rows["grcsm"]["median_evaluations"]
+    starts = value["by_start"]["grcsm"]
+    assert sum(row["slices"] for row in starts) == rows["grcsm"]["slices"]
+    assert all(row["lost_share"] == 0.0 for row in starts if row["slices"])
     assert (tmp_path / "c" / "compare.png").stat().st_size > 10_000
 
 
