@@ -194,3 +194,9 @@ def predict_ranges(rows: Array, beams: BeamSet) -> tuple[Array, Ints]:
     face = np.full(len(beams), -1, np.int64)
     _kernels.predict(rows, 1.0, 0.0, 0.0, 0.0, beams.rays, beams.start, beams.eye, rho, face)
     return rho, face
+
+
+def lower_ranges(rows: Array, pose: Pose2D, beams: BeamSet, rho: Array, face: Ints) -> None:
+    """Lower ranges (n,) to the first of the edges as moved by ``pose``; ``face`` (n,) gets their rows."""
+    c, s = math.cos(pose.theta), math.sin(pose.theta)
+    _kernels.predict(rows, c, s, pose.u, pose.v, beams.rays, beams.start, beams.eye, rho, face)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -13,21 +12,17 @@ from typing import Any
 import numpy as np
 
 from bimfit.config import Config
-from bimfit.estimation.likelihood import BeamModel, BeamSet, edge_rows
-from bimfit.estimation.motion import estimate_joint
-from bimfit.estimation.ownership import Scene, cover_cost, first_round, split_side
-from bimfit.estimation.posterior import Window, component_posterior
-from bimfit.gap.section import gap_section
 from bimfit.geometry.pose import Array
 from bimfit.pipeline.accuracy import accuracy_table, joint_errors, table_text
+from bimfit.pipeline.bench_times import bench_times, times_text
 from bimfit.pipeline.compare import Cut
-from bimfit.pipeline.fit import StationFit, fit_along, fit_slices, fit_station
+from bimfit.pipeline.fit import fit_along, fit_slices
 from bimfit.pipeline.records import JointResult
 from bimfit.pipeline.samples import sample_model
 from bimfit.pipeline.simulate import designed, longest_open
 from bimfit.pipeline.survey import cut_joint, model_joints
-from bimfit.pipeline.targets import TargetCache, prepare
-from bimfit.simulation.accuracy import PAPER_SECONDS_A_SLICE, GapErrors, gap_errors
+from bimfit.pipeline.targets import TargetCache
+from bimfit.simulation.accuracy import GapErrors, gap_errors
 from bimfit.simulation.motion import random_truth
 from bimfit.simulation.oracle import oracle_gap
 from bimfit.simulation.rangefinder import simulate_scan
@@ -187,7 +182,8 @@ def bench_accuracy(joints: int, seed: int, progress: Progress) -> tuple[str, dic
                 data.setdefault("table 1", {})[name] = [dataclasses.asdict(row) for row in rows]
             lines.append(_row("paper variant", "grid", len(paper.errors), paper.figures(), ""))
     progress("times", 1.0)
-    times = bench_times(_TIMED, seed)
+    timed = Case("times", REFERENCE, Scenario(), _TIMED, {})
+    times = bench_times([cut for _, cut in _simulated(timed, seed)])
     data["times"] = times
     head = f"Reference scenario, {joints} joints, seeds {seed} to {seed + joints - 1}"
     return "\n\n".join([head, *tables, "\n".join(lines), _NOTE, times_text(times)]), data
@@ -214,65 +210,6 @@ def _oracle(cut: Cut, truth: JointTruth) -> GapErrors:
     )
 
 
-def bench_times(joints: int, seed: int) -> dict[str, float]:
-    """CPU time of one thread on the reference scenario, tables ready, s: medians over slices or joints."""
-    chain, gaps, posteriors, along = [], [], [], []
-    cache, config = TargetCache(Config()), Config()
-    for _, cut in _simulated(Case("times", REFERENCE, Scenario(), joints, {}), seed):
-        _, sections, slices = cut
-        targets = prepare(sections, slices, cache)
-        fit_station(sections[0], slices[0], targets[0], config)
-        fits = []
-        for section, slice_, target in zip(sections, slices, targets, strict=True):
-            begin = time.thread_time()
-            fits.append(fit_station(section, slice_, target, config))
-            chain.append(time.thread_time() - begin)
-            gaps.append(_gap_time(fits[-1]))
-            posteriors.append(_posterior_time(fits[-1], config))
-        estimates = [f.estimate for f in fits if f.estimate is not None]
-        estimate_joint(estimates, sections, "auto")
-        begin = time.thread_time()
-        estimate_joint(estimates, sections, "auto")
-        along.append(time.thread_time() - begin)
-    one, gap = float(np.median(chain)), float(np.nanmedian(gaps))
-    return {
-        "posterior_a_component": float(np.nanmedian(posteriors)),
-        "gap_a_slice": gap,
-        "chain_a_slice": one + gap,
-        "motion_a_joint": float(np.median(along)),
-        "paper_a_slice": PAPER_SECONDS_A_SLICE["GRCSM"],
-        "paper_over_chain": PAPER_SECONDS_A_SLICE["GRCSM"] / (one + gap),
-    }
-
-
-def _gap_time(fit: StationFit) -> float:
-    """Of measuring the gap with its deviations; NaN without an estimate."""
-    if fit.estimate is None:
-        return math.nan
-    a, b = fit.estimate.components
-    if a.pose is None or b.pose is None:
-        return math.nan
-    section = fit.section
-    begin = time.thread_time()
-    gap_section(section.s, section.frame, section.gap, a.pose, b.pose, a.covariance, b.covariance)
-    return time.thread_time() - begin
-
-
-def _posterior_time(fit: StationFit, config: Config) -> float:
-    """Of one component's posterior from the beams on its side; NaN where there is none."""
-    if fit.estimate is None or fit.estimate.combined is None or fit.slice.beams is None:
-        return math.nan
-    pose, beams = fit.estimate.combined, BeamSet.of(fit.slice.beams)
-    model = BeamModel.of(config.sensor)
-    a, b = fit.section.components
-    scene = Scene.at((edge_rows(a), edge_rows(b)), (pose, pose), beams)
-    use = first_round(0, scene, split_side(scene, beams, np.array([pose.u, pose.v])))
-    cost, rows = cover_cost(beams, model, 0.012), edge_rows(a)
-    begin = time.thread_time()
-    found = component_posterior(rows, pose, beams, cost, model, Window(), use=use)
-    return time.thread_time() - begin if found is not None else math.nan
-
-
 _HEAD = (
     f"{'case':24}{'motion':12}{'joints':>7}{'slices':>7}{'lost':>5}{'flag':>5}{'>5mm':>5}{'mean':>7}{'max':>6}"
     f"{'deg':>6}{'cm3':>6}  {'standardised x z angle w area':30}{'95 % covers x z angle w area':30}"
@@ -293,16 +230,4 @@ def _row(name: str, motion: str, joints: int, f: dict[str, Any], asked: str) -> 
         f"{name:24}{motion:12}{joints:7d}{f['slices']:7d}{f['without_estimate']:5d}{f['flagged']:5d}"
         f"{f['over_5_mm_not_flagged']:5d}{f['mean_mm']:7.3f}{f['max_mm']:6.2f}{f['mean_deg']:6.2f}"
         f"{f['mean_cm3']:6.3f}  {spread:30}{cover:30}{volume:>12}  {asked}"
-    )
-
-
-def times_text(times: dict[str, float]) -> str:
-    """The times as text."""
-    ms = {name: 1e3 * value for name, value in times.items()}
-    return (
-        f"CPU time, one thread, tables ready: posterior {ms['posterior_a_component']:.3f} ms a component "
-        f"(asked 0.25); whole chain {ms['chain_a_slice']:.2f} ms a slice (asked 2.5, aim 1.5; both searches, "
-        f"slide, posteriors, gap); motion models {times['motion_a_joint']:.2f} s a joint of 83 slices "
-        f"(asked 0.5); the paper: {ms['paper_a_slice']:.0f} ms a slice (MATLAB), "
-        f"{times['paper_over_chain']:.0f} times as long"
     )

@@ -38,7 +38,7 @@ from bimfit.pipeline.targets import (
     prepare,
 )
 from bimfit.registration.fitness import own_returns
-from bimfit.registration.matchers import LOCAL, MATCHERS
+from bimfit.registration.matchers import LOCAL, MATCHERS, match_all
 from bimfit.registration.result import MatchResult
 
 if TYPE_CHECKING:
@@ -52,6 +52,8 @@ MOTIONS = ("auto", "independent", "const", "rigid", "linear", "smooth", "kinked"
 """Motion models along the joint."""
 _OTHER_SIGMA, _OTHER_SHARE = 0.1, 0.015
 _NOISE_ROUNDS = 2
+_RUN = 16
+"""Stations searched in one go: enough to keep a table in the cache, few enough to share out."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +157,7 @@ def fit_slices(
     begin = time.perf_counter()
     targets = prepare(sections, slices, cache)
     before = sum(build_seconds(target) for target in distinct(targets))
-    fits = _fit_stations(sections, slices, targets, config, method, threads, progress)
+    fits = _fit_all(sections, slices, targets, config, method, threads, progress)
     noise = None
     if method == "grcsm":
         noise = estimate_noise([fit.estimate for fit in fits if fit.estimate is not None], config.sensor)
@@ -204,29 +206,69 @@ def fit_station(
     section: JointSection, slice_: Slice, targets: Targets, config: Config, method: str = "grcsm"
 ) -> StationFit:
     """One station: the combined model first, then each component in its own small window (paper, 4.4)."""
+    return fit_stations([section], [slice_], targets, config, method)[0]
+
+
+def fit_stations(
+    sections: Sequence[JointSection],
+    slices: Sequence[Slice],
+    targets: Targets,
+    config: Config,
+    method: str = "grcsm",
+) -> list[StationFit]:
+    """:func:`fit_station` for stations that share their targets, a step for all of them at a time.
+
+    The same results; but one table after the other stays in the processor's cache.
+    """
+    fits = search_stations(sections, slices, targets, config, method)
+    return estimate_fits(fits, config.sensor, config) if method == "grcsm" else fits
+
+
+def estimate_fits(fits: Sequence[StationFit], sensor: SensorConfig, config: Config) -> list[StationFit]:
+    """The estimates of stations that have been searched."""
+    return [_estimated(fit, sensor, config) for fit in fits]
+
+
+def search_stations(
+    sections: Sequence[JointSection],
+    slices: Sequence[Slice],
+    targets: Targets,
+    config: Config,
+    method: str = "grcsm",
+) -> list[StationFit]:
+    """The combined searches of :func:`fit_stations`, and then the components'."""
     begin = time.perf_counter()
-    match = MATCHERS[_MATCHER_OF.get(method, method)]
+    name = _MATCHER_OF.get(method, method)
+    near = [matched_slice(slice_, config) for slice_ in slices]
     wide = economic(config.search, targets.stations, COMBINED_BREAK_EVEN)
-    near = matched_slice(slice_, config)
-    combined = match(targets.combined, near, DESIGNED, wide)
-    components: tuple[MatchResult, MatchResult] | None = None
-    if combined.found:
-        search = economic(component_search(section, config), targets.stations, COMPONENT_BREAK_EVEN)
-        shares = (near, near)
-        if method in LOCAL:
-            first, second = own_returns(targets.components, near.points, combined.pose)
-            shares = (
-                dataclasses.replace(near, points=near.points[first], beams=None),
-                dataclasses.replace(near, points=near.points[second], beams=None),
-            )
-        a, b = (
-            match(t, own, combined.pose, search) for t, own in zip(targets.components, shares, strict=True)
-        )
-        components = (a, b)
-    fit = StationFit(section, slice_, combined, components, None, 0.0)
-    if method == "grcsm":
-        fit = dataclasses.replace(fit, estimate=_estimate(fit, config.sensor, config))
-    return dataclasses.replace(fit, seconds=time.perf_counter() - begin)
+    combined = match_all(name, targets.combined, near, [DESIGNED] * len(near), [wide] * len(near))
+    found = [i for i, match in enumerate(combined) if match.found]
+    searches = [
+        economic(component_search(sections[i], config), targets.stations, COMPONENT_BREAK_EVEN) for i in found
+    ]
+    priors = [combined[i].pose for i in found]
+    shares = [_shares(near[i], targets, combined[i].pose, method) for i in found]
+    a, b = (
+        match_all(name, target, [share[which] for share in shares], priors, searches)
+        for which, target in enumerate(targets.components)
+    )
+    components = dict(zip(found, zip(a, b, strict=True), strict=True))
+    seconds = (time.perf_counter() - begin) / max(len(slices), 1)
+    return [
+        StationFit(section, slice_, combined[i], components.get(i), None, seconds)
+        for i, (section, slice_) in enumerate(zip(sections, slices, strict=True))
+    ]
+
+
+def _shares(near: Slice, targets: Targets, pose: Pose2D, method: str) -> tuple[Slice, Slice]:
+    """What each component is matched with: all returns; its own, where a matcher has no window to hold it."""
+    if method not in LOCAL:
+        return near, near
+    a, b = own_returns(targets.components, near.points, pose)
+    return (
+        dataclasses.replace(near, points=near.points[a], beams=None),
+        dataclasses.replace(near, points=near.points[b], beams=None),
+    )
 
 
 def _estimate(fit: StationFit, sensor: SensorConfig, config: Config) -> StationEstimate:
@@ -256,7 +298,7 @@ def component_search(section: JointSection, config: Config) -> SearchConfig:
     return dataclasses.replace(config.search, window=(reach, reach, config.fit.component_angle))
 
 
-def _fit_stations(
+def _fit_all(
     sections: Sequence[JointSection],
     slices: Sequence[Slice],
     targets: Sequence[Targets],
@@ -265,17 +307,27 @@ def _fit_stations(
     threads: int | None,
     progress: Callable[[float], None],
 ) -> list[StationFit]:
-    """All stations, several at a time (the kernels release the GIL)."""
+    """All stations, in runs that share their targets, several runs at a time (kernels release the GIL)."""
     fits: list[StationFit] = []
     with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
         jobs = [
-            pool.submit(fit_station, section, slice_, target, config, method)
-            for section, slice_, target in zip(sections, slices, targets, strict=True)
+            pool.submit(fit_stations, sections[k:end], slices[k:end], targets[k], config, method)
+            for k, end in _runs(targets)
         ]
-        for k, job in enumerate(jobs):
-            fits.append(job.result())
-            progress((k + 1) / len(jobs))
+        for job in jobs:
+            fits += job.result()
+            progress(len(fits) / len(targets))
     return fits
+
+
+def _runs(targets: Sequence[Targets]) -> list[tuple[int, int]]:
+    """First and end of runs of at most RUN stations with the same targets."""
+    out, begin = [], 0
+    for k in range(1, len(targets) + 1):
+        if k == len(targets) or k - begin == _RUN or targets[k] is not targets[begin]:
+            out.append((begin, k))
+            begin = k
+    return out
 
 
 def _with_noise(
@@ -286,7 +338,7 @@ def _with_noise(
         if not _differs(noise.sensor, assumed):
             break
         assumed = noise.sensor
-        fits = [_estimated(fit, assumed, config) for fit in fits]
+        fits = estimate_fits(fits, assumed, config)
         noise = estimate_noise([fit.estimate for fit in fits if fit.estimate is not None], assumed)
     return fits, noise
 
@@ -309,7 +361,7 @@ def _with_shape(fits: list[StationFit], noise: Noise, config: Config) -> tuple[l
     """Free the components' shapes, and estimate again with them."""
     sensor = noise.sensor if config.sensor.adapt else config.sensor
     fits = free_shapes(fits, sensor, config)
-    fits = [_estimated(fit, sensor, config) for fit in fits]
+    fits = estimate_fits(fits, sensor, config)
     noise = estimate_noise([fit.estimate for fit in fits if fit.estimate is not None], sensor)
     return _with_noise(fits, noise, sensor, config)
 

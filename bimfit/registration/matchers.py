@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import time
 from collections.abc import Callable, Sequence
 
@@ -294,3 +295,21 @@ def matcher(name: str) -> Matcher:
         return MATCHERS[name]
     except KeyError:
         raise ConfigError(f"unknown method {name}", remedy=f"choose from {', '.join(MATCHERS)}") from None
+
+
+def match_all(
+    name: str,
+    target: Target,
+    slices: Sequence[Slice],
+    priors: Sequence[Pose2D],
+    configs: Sequence[SearchConfig],
+) -> list[MatchResult]:
+    """Match slices by the matcher of that name, each about its own prior with its own settings."""
+    if name != "grcsm":
+        run = matcher(name)
+        return [run(target, s, p, c) for s, p, c in zip(slices, priors, configs, strict=True)]
+    out: list[MatchResult] = []
+    for config, group in itertools.groupby(range(len(slices)), key=configs.__getitem__):
+        own = list(group)
+        out += match_many(target, [slices[i] for i in own], [priors[i] for i in own], config)
+    return out
