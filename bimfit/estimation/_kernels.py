@@ -477,7 +477,7 @@ def _steep_sum(
     return total
 
 
-@jit
+@jit_inner
 def log_likelihood(
     edges: Array, pose: Array, B: Array, start: Ints, eye: Array, margin: float, bearing: float,
     lines: Array, runs: Ints,
@@ -540,7 +540,7 @@ def _stretch(
     return s0, s1, s2, t0, t1
 
 
-@jit
+@jit_inner
 def normal_equations(
     edges: Array, pose: Array, rs: float, B: Array, start: Ints, eye: Array, soften: float, grazes: int,
     bearing: float, lines: Array, runs: Ints, H: Array, g: Array,

@@ -169,9 +169,9 @@ def usual_step(step: Array) -> float:
 
 def edge_rows(profile: Profile, pose: Pose2D | None = None) -> Array:
     """Edges of a profile as the kernels take them, shape (m, 6): ends and outward unit normal."""
-    edges, normals = profile.edges, profile.normals
-    if pose is not None:
-        edges, normals = pose.apply(edges), pose.turn(normals)
+    if pose is None:
+        return profile.rows
+    edges, normals = pose.apply(profile.edges), pose.turn(profile.normals)
     return np.ascontiguousarray(np.concatenate([edges.reshape(-1, 4), normals], axis=1))
 
 
@@ -194,9 +194,3 @@ def predict_ranges(rows: Array, beams: BeamSet) -> tuple[Array, Ints]:
     face = np.full(len(beams), -1, np.int64)
     _kernels.predict(rows, 1.0, 0.0, 0.0, 0.0, beams.rays, beams.start, beams.eye, rho, face)
     return rho, face
-
-
-def lower_ranges(rows: Array, pose: Pose2D, beams: BeamSet, rho: Array, face: Ints) -> None:
-    """Lower ranges (n,) to the first of the edges as moved by ``pose``; ``face`` (n,) gets their rows."""
-    c, s = math.cos(pose.theta), math.sin(pose.theta)
-    _kernels.predict(rows, c, s, pose.u, pose.v, beams.rays, beams.start, beams.eye, rho, face)

@@ -63,6 +63,11 @@ class Profile:
         return np.asarray(np.stack([d[:, 1], -d[:, 0]], axis=1) / size)
 
     @cached_property
+    def rows(self) -> Array:
+        """Ends and outward unit normal of every edge, shape (n, 6), as kernels take them; never changed."""
+        return np.ascontiguousarray(np.concatenate([self.edges.reshape(-1, 4), self.normals], axis=1))
+
+    @cached_property
     def surface(self) -> Mask:
         """Which of ``edges`` are surface of the component, shape (n,)."""
         if not self.artificial:

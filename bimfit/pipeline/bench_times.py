@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bimfit.config import Config
-from bimfit.estimation.inside import with_inside
+from bimfit.estimation.inside import drop_at_mouth, place_sd, returns_inside
 from bimfit.estimation.likelihood import BeamModel, BeamSet, edge_rows
 from bimfit.estimation.lookalikes import gap_places
 from bimfit.estimation.motion import estimate_joint
@@ -133,7 +133,10 @@ def _stages(fit: StationFit, config: Config) -> dict[str, Callable[[], Any]]:
             component_posterior(own, pose, beams, cost, model, Window(), use=use)
 
     def checks() -> None:
-        with_inside(station, section, beams, sensor.sigma, fit.slice.sweeps)
+        drop_at_mouth(section, station, sensor.sigma)
+        if a.pose is not None and b.pose is not None:
+            spread = place_sd(section, station)
+            returns_inside(section, beams, (a.pose, b.pose), spread, sensor.sigma, fit.slice.sweeps)
         gap_places(section, beams, pose)
 
     def gap() -> None:
