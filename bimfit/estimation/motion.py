@@ -208,6 +208,7 @@ def _sites(estimates: tuple[StationEstimate, ...], sections: Sequence[JointSecti
     """Stations' estimates of one component's reference corner, freed of their priors."""
     n = len(estimates)
     value, precision, step = np.zeros((n, 3)), np.zeros((n, 3, 3)), np.full(n, np.nan)
+    share = np.ones(n)
     for i, (estimate, section) in enumerate(zip(estimates, sections, strict=True)):
         c = estimate.components[which]
         if c.pose is None or c.covariance is None or not c.status.measured:
@@ -229,8 +230,10 @@ def _sites(estimates: tuple[StationEstimate, ...], sections: Sequence[JointSecti
         precision[i] = (axes * np.maximum(values, floor)) @ axes.T
         value[i] = np.linalg.solve(precision[i], at) if values[0] > floor else x
         step[i] = c.corner_step
+        if c.posterior is not None and c.posterior.weak_sd_ranges > 0.0:
+            share[i] = max(1.0 - (c.posterior.weak_sd / c.posterior.weak_sd_ranges) ** 2, 0.0)
     s = np.array([e.s for e in estimates])
-    return Sites(s, value, precision, step)
+    return Sites(s, value, precision, step, share)
 
 
 def _motion_of(pose: Pose2D, corner: Array) -> Array:

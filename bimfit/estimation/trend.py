@@ -22,6 +22,8 @@ _JUMP = np.array([0.004, 0.004, 0.035])
 """What a station that jumps is off by, standard deviations in u, v (m) and theta (rad)."""
 _LEAST = 0.25
 """Cells shared by stations never make a variance less than this share of what it is without."""
+_HARMONICS = 8
+_SOME = 0.05
 _JUMPS = 0.01
 """Share of stations that jump."""
 
@@ -39,12 +41,15 @@ class Sites:
         Inverse covariance without the stations' priors; zero where there is no estimate.
     step : ndarray, shape (n,)
         Bearing of the corner in beam steps; NaN where unknown.
+    share : ndarray, shape (n,)
+        How much of what is known across the gap the beams tell that just miss the corner, and not ranges.
     """
 
     s: Array
     value: Array
     precision: Array
     step: Array
+    share: Array
 
     @property
     def known(self) -> Mask:
@@ -247,20 +252,21 @@ def _left_out(sites: Sites, weight: Array, value: Array, V: Array) -> tuple[Arra
 
 
 def with_shared_cells(sites: Sites, basis: Basis, trend: Trend) -> Trend:
-    """The trend with what neighbouring stations have in common because they see a corner by the same beams.
+    """The trend with what stations have in common because they see a corner between beams.
 
-    With no drift every slice sees the corner between the same two beams, so that averaging does not help
-    across the gap; V = V0 + K E K^T (METHOD, section 5). The correlation (1 - 6 f (1 - f)) exp(-(d / 2.5)^2)
-    is a sum of cosines of d, all positive, times a Gaussian, and so positive definite.
+    A station puts a corner in the middle of the cell between two beams: its error is a sawtooth of the
+    corner's bearing. With no drift it is one and the same, and averaging does not help across the gap; with
+    drift, stations err in opposite ways as often as in the same; V = V0 + K E K^T (METHOD, section 5).
     """
-    k = np.flatnonzero(sites.known & np.isfinite(sites.step))
+    k = np.flatnonzero(sites.known & np.isfinite(sites.step) & (sites.share > _SOME))
     if len(k) < 2:
         return trend
-    d = sites.step[k, None] - sites.step[None, k]
-    f = d - np.floor(d)
-    rho = (1.0 - 6.0 * f * (1.0 - f)) * np.exp(-((d / 2.5) ** 2))
+    s = np.sqrt(sites.share[k] / np.maximum(sites.precision[k, 0, 0], 1e-6))
+    R = np.einsum("ik,a->kai", basis.functions[k], np.eye(3)[0]).reshape(-1, len(k))[basis.moves.ravel()]
+    rho = cell_correlation(
+        s / sites.share[k], sites.step[k], (trend.value - sites.value)[k, 0], R.T @ trend.spread @ R
+    )
     np.fill_diagonal(rho, 0.0)
-    s = 1.0 / np.sqrt(np.maximum(sites.precision[k, 0, 0], 1e-6))
     pull = sites.precision[k, :, 0] * trend.weight[k, None]
     R = np.einsum("ik,ia->kai", basis.functions[k], pull).reshape(-1, len(k))
     G = trend.spread @ R[basis.moves.ravel()]
@@ -274,6 +280,36 @@ def with_shared_cells(sites: Sites, basis: Basis, trend: Trend) -> Trend:
     wide = root @ axes
     shared = (wide * np.maximum(values, _LEAST - 1.0)) @ wide.T
     return replace(trend, covariance=trend.covariance + _blocks(shared, basis), spread=trend.spread + shared)
+
+
+def cell_correlation(sd: Array, step: Array, off: Array, spread: Array) -> Array:
+    """Correlation (n, n) of the errors that the cells between beams make at n stations.
+
+    For two corners d steps of the beams apart it is 1 - 6 f (1 - f), f the fraction of d. That is a sum of
+    cosines, 6 / (pi k)^2 cos(2 pi k d), and each fades as exp(-2 (pi k)^2 var d) where d is uncertain: all
+    terms are positive definite, and so is the sum.
+
+    Parameters
+    ----------
+    sd : ndarray, shape (n,)
+        Of each station across the gap: that of an even spread over its cell, m.
+    step : ndarray, shape (n,)
+        Bearing of each corner as its station puts it, in beam steps.
+    off : ndarray, shape (n,)
+        How far from there, across the gap, it really is, as far as is known, m.
+    spread : ndarray, shape (n, n)
+        Covariance of where the corners are, m^2.
+    """
+    pitch = np.sqrt(12.0) * np.median(sd)
+    at = step + off / pitch
+    d = at[:, None] - at[None, :]
+    own = np.diag(spread)
+    variance = (own[:, None] + own[None, :] - 2.0 * spread) / pitch**2
+    out: Array = np.zeros_like(d)
+    for k in range(1, _HARMONICS + 1):
+        wave = np.pi * k
+        out += 6.0 / wave**2 * np.cos(2.0 * wave * d) * np.exp(-2.0 * wave**2 * np.maximum(variance, 0.0))
+    return out
 
 
 class Evidence:

@@ -12,7 +12,19 @@ from bimfit.errors import ConfigError
 from bimfit.estimation import _kernels_knots as kernels
 from bimfit.estimation.motion import estimate_joint
 from bimfit.estimation.result import ComponentEstimate, StationEstimate
-from bimfit.estimation.trend import NODES, Basis, Evidence, Sites, bends, fit, hats, polynomial, smooth, solve
+from bimfit.estimation.trend import (
+    NODES,
+    Basis,
+    Evidence,
+    Sites,
+    bends,
+    cell_correlation,
+    fit,
+    hats,
+    polynomial,
+    smooth,
+    solve,
+)
 from bimfit.geometry.frame import SectionFrame
 from bimfit.geometry.joint_section import GapOutline, JointSection
 from bimfit.geometry.pose import Pose2D
@@ -242,35 +254,64 @@ def test_independent_changes_nothing_and_unknown_models_are_refused():
 
 
 def test_stations_that_share_a_beam_cell_do_not_average():
-    """All corners at one bearing: the error across the gap is common, and the covariance must know."""
+    """A corner that stays between two beams is off by the same at every station, and the covariance knows."""
     rng = np.random.default_rng(8)
-    stations = _stations(rng, _truth("const", rng))
+    pitch = np.sqrt(12.0) * SD[0]
 
-    def at(step):
-        return [
+    def sd_u(bearings):
+        # stations put a corner in the middle of the cell that it is in
+        noise = rng.normal(0.0, SD, (2, N, 3))
+        noise[:, :, 0] = (np.floor(bearings) + 0.5 - bearings) * pitch
+        stations = [
             dataclasses.replace(
-                e, components=tuple(dataclasses.replace(c, corner_step=step(i)) for c in e.components)
+                e,
+                components=tuple(
+                    dataclasses.replace(c, corner_step=float(np.floor(bearings[i]) + 0.5))
+                    for c in e.components
+                ),
             )
-            for i, e in enumerate(stations)
+            for i, e in enumerate(_stations(_Given(noise), _truth("const", rng)))
         ]
-
-    def sd_u(result):
-        c = result.stations[41].components[0]
+        c = estimate_joint(stations, _sections(), "const").stations[41].components[0]
         arm = c.pose.turn(CORNERS[0])
         J = np.array([1.0, 0.0, -arm[1]])
         return float(np.sqrt(J @ c.covariance @ J))
 
-    same = sd_u(estimate_joint(at(lambda i: 2.25), _sections(), "const"))
-    drifting = sd_u(estimate_joint(at(lambda i: 0.37 * i), _sections(), "const"))
-    assert same == pytest.approx(SD[0], rel=0.05)
-    assert drifting < 0.35 * SD[0]
+    assert sd_u(np.full(N, 2.25)) == pytest.approx(SD[0], rel=0.05)
+    assert sd_u(0.37 * np.arange(N)) < 0.35 * SD[0]
+
+
+class _Given:
+    """Hands out errors (2, N, 3) that were drawn before, a station and a component at a time."""
+
+    def __init__(self, errors):
+        self.errors = iter(errors.transpose(1, 0, 2).reshape(-1, 3))
+
+    def normal(self, *_):
+        return next(self.errors)
+
+
+def test_correlation_of_cells_is_that_of_drawn_sawteeth():
+    """Corners anywhere, their distances uncertain: errors of the middle of the cell, drawn and counted."""
+    rng = np.random.default_rng(18)
+    pitch, sd = 1.5e-3, 1.5e-3 / np.sqrt(12.0)
+    places = np.array([0.2, 0.35, 0.7, 2.2, 9.9]) * pitch
+    spread = np.diag(np.square([0.0, 0.05, 0.1, 0.2, 0.5]) * pitch**2)
+    drawn = places + rng.normal(size=(200_000, 5)) * np.sqrt(np.diag(spread))
+    drawn += rng.uniform(0.0, pitch, (200_000, 1))
+    error = drawn - (np.floor(drawn / pitch) + 0.5) * pitch
+    middle = (np.floor(places / pitch) + 0.5) * pitch
+    rho = cell_correlation(np.full(5, sd), middle / pitch, places - middle, spread)
+    off = ~np.eye(5, dtype=bool)
+    assert np.allclose(rho[off], np.corrcoef(error.T)[off], atol=0.02)
+    assert rho[0, 1] > 0.2 and rho[0, 2] < -0.2
 
 
 def _random_sites(rng, n=30):
     s = np.sort(rng.uniform(0.0, 1.0, n))
     M = rng.normal(size=(n, 3, 3))
     precision = np.einsum("iab,icb->iac", M, M) * 1e6 + 1e5 * np.eye(3)
-    return Sites(s, rng.normal(0.0, 3e-3, (n, 3)), precision, np.full(n, np.nan))
+    return Sites(s, rng.normal(0.0, 3e-3, (n, 3)), precision, np.full(n, np.nan), np.ones(n))
 
 
 def test_least_squares_agrees_with_numpy():
@@ -361,7 +402,7 @@ def test_many_dense_stations_are_as_good_as_few_and_not_slow_beyond_reason():
     s = np.linspace(0.0, 1.2, n)
     truth = 5e-3 * np.sin(3.0 * s)[:, None] * np.array([1.0, 1.0, 4.0])
     precision = np.broadcast_to(np.diag(1.0 / SD**2), (n, 3, 3)).copy()
-    sites = Sites(s, truth + rng.normal(0.0, SD, (n, 3)), precision, np.full(n, np.nan))
+    sites = Sites(s, truth + rng.normal(0.0, SD, (n, 3)), precision, np.full(n, np.nan), np.ones(n))
     basis = smooth(s, (0.05, 0.2))
     assert basis.functions.shape[1] <= NODES + 1
     t = fit(sites, basis)
