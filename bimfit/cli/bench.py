@@ -17,6 +17,9 @@ def run(
         100, "--joints", min=1, help="Random joints (matcher-3d: starts; fuzz: files)."
     ),
     seed: int = typer.Option(1000, "--seed", min=0, help="Seed of the first joint."),
+    case: str | None = typer.Option(
+        None, "--case", metavar="NAME", help="Of accuracy: this case alone, with all of the joints."
+    ),
     json_file: Path | None = typer.Option(
         None, "--json", metavar="FILE", help="Write the figures there, too."
     ),
@@ -29,8 +32,10 @@ def run(
 
     if suite not in SUITES:
         raise ConfigError(f"unknown suite {suite}", remedy=f"choose from {', '.join(SUITES)}")
+    if case is not None and suite != "accuracy":
+        raise ConfigError(f"the suite {suite} has no cases", remedy="leave --case out")
     with terminal_progress() as progress:
-        result = bench(suite, joints=joints, seed=seed, progress=progress)
+        result = bench(suite, joints=joints, seed=seed, progress=progress, case=case)
     if json_file is not None:
         write_text(json_file, to_json({"suite": suite, "joints": joints, "seed": seed, **result.data}))
     print(result.text)

@@ -41,10 +41,17 @@ class Bench:
     data: dict[str, Any]
 
 
-def bench(suite: str, *, joints: int, seed: int, progress: Progress) -> Bench:
-    """Run one suite of :data:`SUITES` over so many seeded joints (fuzz: files)."""
+def bench(suite: str, *, joints: int, seed: int, progress: Progress, case: str | None = None) -> Bench:
+    """Run one suite of :data:`SUITES` over so many seeded joints (fuzz: files); one case of it where named.
+
+    Raises
+    ------
+    ConfigError
+        For a case that the suite does not have.
+    """
     module, name = SUITES[suite].split(":")
-    result = getattr(importlib.import_module(module), name)(joints, seed, progress)
+    chosen = {} if case is None else {"only": case}
+    result = getattr(importlib.import_module(module), name)(joints, seed, progress, **chosen)
     return result if isinstance(result, Bench) else Bench(*result)
 
 

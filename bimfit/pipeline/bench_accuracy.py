@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from bimfit.config import Config
+from bimfit.errors import ConfigError
 from bimfit.geometry.pose import Array
 from bimfit.pipeline.accuracy import accuracy_table, joint_errors, table_text
 from bimfit.pipeline.bench_times import bench_times, times_text
@@ -148,9 +149,29 @@ def _cover(z: Array) -> float:
     return float(np.mean(np.abs(z) < _NORMAL)) if len(z) else math.nan
 
 
-def bench_accuracy(joints: int, seed: int, progress: Progress) -> tuple[str, dict[str, Any]]:
-    """Every case, the oracle, the paper's method, and times; text and data."""
+def chosen_cases(joints: int, only: str | None) -> tuple[Case, ...]:
+    """All cases, or the one of a name, with all of the joints.
+
+    Raises
+    ------
+    ConfigError
+        Where there is none of that name.
+    """
     every = cases(joints)
+    if only is None:
+        return every
+    named = tuple(dataclasses.replace(case, joints=joints) for case in every if case.name == only)
+    if not named:
+        known = "; ".join(case.name for case in every)
+        raise ConfigError(f"no case of that name: {only}", remedy=f"choose from: {known}")
+    return named
+
+
+def bench_accuracy(
+    joints: int, seed: int, progress: Progress, only: str | None = None
+) -> tuple[str, dict[str, Any]]:
+    """Every case (or ``only`` one), the oracle, the paper's method, and times; text and data."""
+    every = chosen_cases(joints, only)
     total, done = sum(case.joints for case in every), 0
     data: dict[str, Any] = {}
     tables: list[str] = []
@@ -185,7 +206,8 @@ def bench_accuracy(joints: int, seed: int, progress: Progress) -> tuple[str, dic
     timed = Case("times", REFERENCE, Scenario(), _TIMED, {})
     times = bench_times([cut for _, cut in _simulated(timed, seed)])
     data["times"] = times
-    head = f"Reference scenario, {joints} joints, seeds {seed} to {seed + joints - 1}"
+    what = "Reference scenario" if only is None else only
+    head = f"{what}, {joints} joints, seeds {seed} to {seed + joints - 1}"
     return "\n\n".join([head, *tables, "\n".join(lines), _NOTE, times_text(times)]), data
 
 
