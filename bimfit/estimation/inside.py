@@ -19,7 +19,7 @@ _SURE = 2.5
 _SAME = 4.0
 _FEW, _LAST = 12, 6
 _ON_CHAIN = 1e-6
-_SUSPICIOUS = 1.8
+_SUSPICIOUS = 2.2
 """A drop at the mouth that large, of both sides together, is worth the test of cut edges."""
 _ODDS = (4.0, 1.0, 0.0, -math.inf)
 """Greatest log-odds of cut edges with no return inside the gap, with one, two and more."""
