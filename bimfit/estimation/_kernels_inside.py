@@ -225,3 +225,45 @@ def holes(
                 count += 1
             last, u0, v0 = k, u, v
     return out[:count]
+
+
+@jit
+def far_grazing(
+    edges_a: Array,
+    edges_b: Array,
+    pose: Array,
+    rho: Array,
+    face: Ints,
+    rays: Array,
+    start: Ints,
+    eye: Array,
+    steep: float,
+    far: float,
+    use: Mask,
+) -> None:
+    """Clear ``use`` where a beam is predicted to graze a face far from the mouth, whichever component's.
+
+    Parameters
+    ----------
+    edges_a, edges_b : (m, 6)
+        As designed.
+    pose : (3,)
+        Where both components are taken to be; rho, face (2, n) are what it predicts.
+    steep : float
+        A beam grazes where |n.d| is less.
+    far : float
+        From the mouth's middle, m.
+    """
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    for which in range(2):
+        edges = edges_a if which == 0 else edges_b
+        for g in range(eye.shape[0]):
+            for k in range(start[g], start[g + 1]):
+                e, r = face[which, k], rho[which, k]
+                if e < 0 or not r < np.inf:
+                    continue
+                nx = cos * edges[e, 4] - sin * edges[e, 5]
+                ny = sin * edges[e, 4] + cos * edges[e, 5]
+                x, y = eye[g, 0] + rays[1, k] * r - pose[0], eye[g, 1] + rays[2, k] * r - pose[1]
+                if abs(nx * rays[1, k] + ny * rays[2, k]) < steep and math.hypot(x, y) > far:
+                    use[k] = False

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bimfit.config import FitConfig, SensorConfig
+from bimfit.estimation import _kernels_inside as kernels
 from bimfit.estimation import checks
 from bimfit.estimation.cloud import irregular_sensor, virtual_beams
 from bimfit.estimation.inside import with_inside
@@ -42,6 +43,7 @@ from bimfit.geometry.status import Status
 _FEW_THROUGH = 3
 _UNKNOWN_RANGE = 1.0
 _FAR_ALONG = 0.025
+_GRAZING, _FAR_OUT = 0.3, 0.2
 _WORTH_A_LOOK = -15.0
 _LOOSE = 5.0
 
@@ -305,14 +307,22 @@ def _through(context: _Context, poses: Sequence[Pose2D], scene: Scene) -> int:
 
 
 def _usable(context: _Context, scene: Scene, side: Ints, pose: Pose2D) -> Mask:
-    components = context.section.components
+    """Beams that may speak: away from ends that are no surface, and not grazing a face far out.
+
+    There a milliradian moves a range by millimetres, a ridge so sharp that the quadrature's cells miss it.
+    """
+    components, beams = context.section.components, context.beams
     surface = (components[0].surface, components[1].surface)
-    if surface[0].all() and surface[1].all():
-        return np.ones(len(context.beams), bool)
-    edges = (pose.apply(components[0].edges), pose.apply(components[1].edges))
-    return ~beside_artificial_ends(
-        scene, side, context.beams, edges, surface, 2.0 * context.fit.placement_tolerance
-    )
+    use = np.ones(len(beams), bool)
+    if not (surface[0].all() and surface[1].all()):
+        edges = (pose.apply(components[0].edges), pose.apply(components[1].edges))
+        margin = 2.0 * context.fit.placement_tolerance
+        use = ~beside_artificial_ends(scene, side, beams, edges, surface, margin)
+    kernels.far_grazing(
+        *context.rows, pose.as_array(), scene.ranges, scene.faces, beams.rays, beams.start, beams.eye,
+        _GRAZING, _FAR_OUT, use,
+    )  # fmt: skip
+    return use
 
 
 def _place(context: _Context, combined: Pose2D, rivals: Sequence[Pose2D]) -> tuple[SlideResult, Cost]:

@@ -20,7 +20,7 @@ NODES = 150
 _NU = 4.0
 _JUMP = np.array([0.004, 0.004, 0.035])
 """What a station that jumps is off by, standard deviations in u, v (m) and theta (rad)."""
-_LEAST = 0.25
+_LEAST = 0.75
 """Cells shared by stations never make a variance less than this share of what it is without."""
 _HARMONICS = 8
 _SOME = 0.05
