@@ -11,7 +11,10 @@ from bimfit.cli.progress import terminal_progress
 
 def run(
     suite: str = typer.Option(
-        "accuracy", "--suite", metavar="NAME", help="accuracy, matcher, matcher-3d, scan, bim, back or fuzz."
+        "accuracy",
+        "--suite",
+        metavar="NAME",
+        help="accuracy, refusal, matcher, matcher-3d, scan, bim, back or fuzz.",
     ),
     joints: int = typer.Option(
         100, "--joints", min=1, help="Random joints (matcher-3d: starts; fuzz: files)."
