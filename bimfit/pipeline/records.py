@@ -153,6 +153,12 @@ class JointResult:
         return any(station.gap is not None for station in self.stations)
 
     @property
+    def share_without_data(self) -> float:
+        """Share of the stations that hold too little to say anything, 0 to 1; 1 without stations."""
+        none = [station.status.name == "no_data" for station in self.stations]
+        return sum(none) / len(none) if none else 1.0
+
+    @property
     def reason(self) -> str:
         """Why the joint has no estimate: what most of its stations say."""
         if self.measured:
@@ -160,7 +166,7 @@ class JointResult:
         if not self.stations:
             return "the scan shows no station of it"
         reasons = [station.status.reason for station in self.stations]
-        return max(set(reasons), key=reasons.count)
+        return max(reasons, key=reasons.count)
 
 
 @dataclass(frozen=True)

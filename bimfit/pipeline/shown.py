@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -12,12 +13,56 @@ from bimfit.geometry.pose import Array
 from bimfit.geometry.slice import Slice
 from bimfit.pipeline.targets import expected_viewpoint, match_reach, matched_edges
 
+if TYPE_CHECKING:
+    from bimfit.bim.joint import Joint
+    from bimfit.pipeline.records import JointResult
+
+Cut: TypeAlias = "tuple[Joint, tuple[JointSection, ...], tuple[Slice, ...]]"
+LEAST_SHOWN = 0.7
+"""A joint not asked for by name is fitted where both components show at this share of its stations."""
+MOST_WITHOUT_DATA = 0.5
+"""... and, if nothing of it was measured, kept where at most this share of its stations has no data."""
 SURFACE = 0.1
 """How far from a component's mouth corner its visible surface is looked at, m."""
 NEAR = 0.04
 """A return this near a component's designed surface may belong to it, m."""
 LOOKS = 40
 """So many stations of a joint are looked at, evenly spread."""
+
+
+def fully_shown(cuts: Sequence[Cut], config: Config) -> tuple[list[Cut], list[str]]:
+    """Leave out joints of which the scan shows one side only, or what stands beside them: kept, ids left.
+
+    Where that would leave none, all are kept: their fits then say what is wrong.
+    """
+    kept = [c for c in cuts if share_shown(c[1], c[2], config).min() >= LEAST_SHOWN]
+    if not kept:
+        return list(cuts), []
+    ids = {c[0].id for c in kept}
+    return kept, [c[0].id for c in cuts if c[0].id not in ids]
+
+
+def fitted_shown(results: Sequence[JointResult]) -> tuple[list[JointResult], list[str]]:
+    """Leave out joints whose stations turned out to hold next to nothing of a component: kept, ids left.
+
+    That something is missing where it should be is a result and stays, and where none is left all do.
+    """
+    kept = [r for r in results if r.measured or r.share_without_data <= MOST_WITHOUT_DATA]
+    if not kept:
+        return list(results), []
+    ids = {r.joint.id for r in kept}
+    return kept, [r.joint.id for r in results if r.joint.id not in ids]
+
+
+def left_out(ids: Sequence[str]) -> list[str]:
+    """A note that names joints that were left out, if any."""
+    if not ids:
+        return []
+    named = ", ".join(sorted(ids)[:6]) + (", ..." if len(ids) > 6 else "")
+    return [
+        f"left out {len(ids)} joint{'s' if len(ids) > 1 else ''} that the scan shows only in part "
+        f"({named}); --joint ID fits one all the same"
+    ]
 
 
 def share_shown(sections: Sequence[JointSection], slices: Sequence[Slice], config: Config) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from bimfit.pipeline.mouth import spine_stations
 from bimfit.pipeline.placing import NEAR, Placed, Placing, joint_boxes, place_scan
 from bimfit.pipeline.profile_file import TaughtProfile
 from bimfit.pipeline.records import JointResult, SurveyResult
-from bimfit.pipeline.shown import share_shown
+from bimfit.pipeline.shown import fitted_shown, fully_shown, left_out
 from bimfit.pipeline.targets import match_reach, profile_reach, with_assumed_view, with_recovered_view
 from bimfit.scan.cloud import PointCloud
 from bimfit.scan.coverage import covers, scan_stations, slice_thickness
@@ -36,11 +36,8 @@ if TYPE_CHECKING:
     from bimfit.bim.selection import Selection
 
 Scan = LineScan | PointCloud
-Cut: TypeAlias = "tuple[Joint, tuple[JointSection, ...], tuple[Slice, ...]]"
 LEAST_COVER = 0.3
 """A joint that was not asked for by name is fitted where the scan shows at least this share of it."""
-LEAST_SHOWN = 0.7
-"""... and where both of its components show themselves at this share of the stations."""
 Progress = Callable[[str, float], None]
 
 
@@ -97,7 +94,7 @@ def survey(
     results: list[JointResult] = []
     progress("cutting the joints", 0.0)
     cuts = [cut_joint(model, joint, part_of(placed.nearby, joint, config), config) for joint in chosen]
-    cuts, partly = (cuts, "") if asked else fully_shown(cuts, config)
+    cuts, partly = (cuts, []) if asked else fully_shown(cuts, config)
     if profile is not None:
         cuts = [(facing, profile.applied(sections), slices) for facing, sections, slices in cuts]
     for k, (facing, sections, slices) in enumerate(cuts):
@@ -113,8 +110,11 @@ def survey(
                 progress=partial(progress, step),
             )
         )
+    if not asked:
+        results, unseen = fitted_shown(results)
+        partly = [*partly, *unseen]
     said = (*model.notes, *model.left_out(most=3), *placed.notes)
-    notes = (*said, *([partly] if partly else []))
+    notes = (*said, *left_out(partly))
     return SurveyResult(
         model_path, scan_path, model, placed.nearby.scan, config, tuple(results), notes, placed
     )
@@ -190,23 +190,6 @@ def covered_joints(
 def part_of(scan: Scan | Nearby, joint: Joint, config: Config, margin: float = 0.0) -> Scan:
     """What of a scan matters to a joint."""
     return scan.around(joint_boxes(joint, config, margin)) if isinstance(scan, Nearby) else scan
-
-
-def fully_shown(cuts: Sequence[Cut], config: Config) -> tuple[list[Cut], str]:
-    """Leave out joints of which the scan shows one component only, or what stands beside them, and say so.
-
-    Where that would leave none, all are kept: their fits then say what is wrong.
-    """
-    kept = [c for c in cuts if share_shown(c[1], c[2], config).min() >= LEAST_SHOWN]
-    if not kept or len(kept) == len(cuts):
-        return list(cuts), ""
-    ids = {c[0].id for c in kept}
-    left = sorted(c[0].id for c in cuts if c[0].id not in ids)
-    named = ", ".join(left[:6]) + (", ..." if len(left) > 6 else "")
-    return kept, (
-        f"left out {len(left)} joint{'s' if len(left) > 1 else ''} that the scan shows only in part "
-        f"({named}); --joint ID fits one all the same"
-    )
 
 
 def cut_joint(
