@@ -96,9 +96,11 @@ class Joint:
         middle = 0.5 * (path.points[1:] + path.points[:-1])
         sight = np.asarray(viewpoint, float) - middle
         cosine = np.einsum("ij,ij->i", path.v, sight) / np.maximum(np.linalg.norm(sight, axis=1), 1e-9)
-        if float(cosine @ path.leg_lengths) >= 0.0:
-            return self
-        return replace(self, path=path.flipped(), legs=self.legs[::-1])
+        return self if float(cosine @ path.leg_lengths) >= 0.0 else self.turned()
+
+    def turned(self) -> Joint:
+        """The joint with its mouth on the other side."""
+        return replace(self, path=self.path.flipped(), legs=self.legs[::-1])
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, with the keys that the contract names."""

@@ -1,4 +1,4 @@
-"""Which joints a scan really shows: both components, not just one of them or what stands beside."""
+"""Which joints a scan really shows, with both components, and from which side."""
 
 from __future__ import annotations
 
@@ -76,6 +76,24 @@ def share_shown(sections: Sequence[JointSection], slices: Sequence[Slice], confi
     picked = np.unique(np.linspace(0, len(sections) - 1, min(LOOKS, len(sections))).round().astype(int))
     shown = [_shown(sections[k], slices[k], config) for k in picked]
     return np.asarray(np.mean(shown, axis=0))
+
+
+def surface_shown(sections: Sequence[JointSection], slices: Sequence[Slice], config: Config) -> float:
+    """How much of what the slices hold lies on the components' visible surface beside the mouth, as designed.
+
+    In returns; one that is off by ``config.fit.placement_sigma`` counts 0.6.
+    """
+    total = 0.0
+    for section, slice_ in zip(sections, slices, strict=True):
+        edges = matched_edges(section, expected_viewpoint(slice_, section), config)
+        nearest = np.minimum(
+            *(
+                _distances(slice_.points, part, corner)
+                for part, corner in zip(edges, section.gap.mouth, strict=True)
+            )
+        )
+        total += float(np.exp(-0.5 * (nearest / config.fit.placement_sigma) ** 2).sum())
+    return total
 
 
 def _shown(section: JointSection, slice_: Slice, config: Config) -> tuple[bool, bool]:

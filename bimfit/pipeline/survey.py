@@ -23,7 +23,7 @@ from bimfit.pipeline.mouth import spine_stations
 from bimfit.pipeline.placing import NEAR, Placed, Placing, joint_boxes, place_scan
 from bimfit.pipeline.profile_file import TaughtProfile
 from bimfit.pipeline.records import JointResult, SurveyResult
-from bimfit.pipeline.shown import fitted_shown, fully_shown, left_out
+from bimfit.pipeline.shown import LOOKS, fitted_shown, fully_shown, left_out, surface_shown
 from bimfit.pipeline.targets import match_reach, profile_reach, with_assumed_view, with_recovered_view
 from bimfit.scan.cloud import PointCloud
 from bimfit.scan.coverage import covers, scan_stations, slice_thickness
@@ -203,14 +203,42 @@ def cut_joint(
         The joint as seen, its designed sections, and a slice for each.
     """
     eye = viewpoint_of(scan, joint)
-    if eye is not None:
-        joint = joint.facing(eye)
+    joint = seen_side(elements, joint, scan, config) if eye is None else joint.facing(eye)
     mouth = mouth_paths(joint)[0]
     along = scan_stations(scan, mouth, config.slices.spacing)
+    sections, slices = _cut_at(elements, joint, scan, config, along)
+    if eye is None:
+        slices = with_recovered_view(slices)
+    viewed = [with_assumed_view(cut, section) for cut, section in zip(slices, sections, strict=True)]
+    return joint, tuple(sections), tuple(viewed)
+
+
+def seen_side(
+    elements: HasElements | Mapping[str, HasMesh], joint: Joint, scan: Scan, config: Config
+) -> Joint:
+    """The joint with its mouth on the side whose surface the points lie on, where both are free.
+
+    For a cloud that does not know its sensor. Points on both sides: the mouth stays where more of them are.
+    """
+    if not joint.two_sided:
+        return joint
+    shown = []
+    for facing in (joint, joint.turned()):
+        along = scan_stations(scan, mouth_paths(facing)[0], config.slices.spacing)
+        picked = along[np.unique(np.linspace(0, len(along) - 1, min(LOOKS, len(along))).astype(int))]
+        shown.append((surface_shown(*_cut_at(elements, facing, scan, config, picked), config), facing))
+    return max(shown, key=lambda pair: pair[0])[1]
+
+
+def _cut_at(
+    elements: HasElements | Mapping[str, HasMesh], joint: Joint, scan: Scan, config: Config, along: Array
+) -> tuple[Sequence[JointSection], Sequence[Slice]]:
+    """Design and scan at places along a joint's mouth (k,); a few have no section plane."""
+    mouth = mouth_paths(joint)[0]
     stations = spine_stations(joint.path, mouth, along)
     sections = design_sections(elements, joint, stations, profile_reach(config)) if len(stations) else ()
     if not sections:
-        return joint, (), ()
+        return (), ()
     thickness = config.slices.thickness or slice_thickness(scan, mouth, config.slices.spacing)
     slices = cut_slices(
         scan,
@@ -219,10 +247,7 @@ def cut_joint(
         thickness=thickness,
         reach=match_reach(config),
     )
-    if eye is None:
-        slices = with_recovered_view(slices)
-    viewed = [with_assumed_view(cut, section) for cut, section in zip(slices, sections, strict=True)]
-    return joint, tuple(sections), tuple(viewed)
+    return sections, slices
 
 
 def viewpoint_of(scan: Scan, joint: Joint) -> Array | None:

@@ -22,6 +22,7 @@ NEAREST_SLICES = 5e-3
 """Slices of a cloud are at least this far apart: in less, nothing that is built moves, m."""
 THIN = 0.01
 """Stations farther apart get slices no thicker, if the scan allows: a joint moves along its way, m."""
+_HOLE, _FEW_HOLES = 0.25, 0.1
 _CELL = 0.005
 _CELL_POINTS = 3
 _MOST_BEAMS = 500_000
@@ -59,7 +60,7 @@ def scan_stations(
 
     With ``spacing``, on the multiples of it that the scan covers. Without it, at every sweep that lies across
     the joint (sweeps within 1 mm of one another share a station), or such that slices of a cloud have about
-    40 points within reach, but at least 5 mm apart.
+    40 points within reach, but at least 5 mm apart, and no more of them than the cloud has rows.
 
     Parameters
     ----------
@@ -86,10 +87,43 @@ def scan_stations(
     s, count = _along(scan, path, reach)
     if not len(s):
         return s
+    return _cloud_stations(s, count)
+
+
+def _cloud_stations(s: Array, count: float) -> Array:
+    """Stations of a cloud of ``count`` points from where a sample of them lies along the joint, s (m,).
+
+    Evenly spread; but a cloud whose rows lie across the joint, farther apart than that, gets one a row.
+    """
     low, high = np.quantile(s, [0.002, 0.998])
     extent = max(float(high - low), 1e-9)
-    stations = int(np.clip(count / SLICE_POINTS, 1, min(MOST_STATIONS, max(1.0, extent / NEAREST_SLICES))))
-    return np.asarray(low + extent * (np.arange(stations) + 0.5) / stations)
+    most = int(np.clip(count / SLICE_POINTS, 1, min(MOST_STATIONS, max(1.0, extent / NEAREST_SLICES))))
+    stations = most
+    while stations > 1 and _holes(s, low, extent / stations) > _FEW_HOLES:
+        stations = min(stations - 1, int(stations / 1.05))
+    if stations == most:
+        return np.asarray(low + extent * (np.arange(stations) + 0.5) / stations)
+    inside = np.sort(s[(s >= low) & (s <= high)])
+    rows = np.split(inside, np.flatnonzero(np.diff(inside) > 0.25 * extent / stations) + 1)
+    if len(rows) >= 0.8 * stations:
+        return np.array([row.mean() for row in rows])
+    places = np.histogram(s, stations, (low, high), weights=s)[0]
+    filled = np.histogram(s, stations, (low, high))[0]
+    return np.asarray(places[filled > 0] / filled[filled > 0])
+
+
+def _holes(s: Array, low: float, cell: float) -> float:
+    """Share of the cells that are all but empty beside a full one: high where points lie in rows.
+
+    The highest of four, for cells that begin a quarter of a cell apart, since rows may lie on borders.
+    """
+    most = 0.0
+    for start in low - cell * np.array([0.0, 0.25, 0.5, 0.75]):
+        filled = np.bincount(np.maximum(np.floor((s - start) / cell), 0.0).astype(np.int64))
+        around = np.maximum(np.r_[0, filled[:-1]], np.r_[filled[1:], 0])
+        poor = filled < _HOLE * around
+        most = max(most, float(poor.mean()))
+    return most
 
 
 def slice_thickness(

@@ -369,3 +369,23 @@ def test_rays_enter_boxes_where_shapely_says(seed):
         assert enters == np.inf
     else:
         assert enters == pytest.approx(shapely.distance(shapely.Point(o), met), abs=1e-9)
+
+
+@pytest.mark.parametrize("pitch", [0.006, 0.010, 0.013, 0.030])
+@pytest.mark.parametrize("smear", [0.0, 0.06])
+def test_a_cloud_in_rows_across_the_joint_has_a_station_a_row(pitch, smear):
+    rng = np.random.default_rng(1)
+    rows = np.arange(0.05, 0.75, pitch)
+    s = np.repeat(rows, 150) + smear * pitch * rng.uniform(-1.0, 1.0, 150 * len(rows))
+    points = np.column_stack([rng.uniform(-0.2, 0.2, len(s)), s, np.zeros(len(s))])
+    stations = scan_stations(PointCloud(points), PATH)
+    assert len(stations) == len(rows)
+    np.testing.assert_allclose(stations, rows, atol=5e-4)
+
+
+def test_a_hole_in_a_cloud_is_not_taken_for_rows():
+    rng = np.random.default_rng(1)
+    s = rng.uniform(0.0, LENGTH, 40_000)
+    points = np.column_stack([rng.uniform(-0.2, 0.2, len(s)), s, np.zeros(len(s))])
+    whole, holed = (scan_stations(PointCloud(p), PATH) for p in (points, points[(s < 0.3) | (s > 0.6)]))
+    np.testing.assert_allclose(np.diff(holed), np.diff(whole).mean(), rtol=0.01)
