@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bimfit.config import FitConfig, SensorConfig, ShapeConfig
+from bimfit.estimation.components import reshaped
 from bimfit.estimation.posterior import Posterior
 from bimfit.estimation.result import StationEstimate
-from bimfit.estimation.station import reshaped
 from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.pose import Array
 from bimfit.geometry.shape import deformed, has_freedom

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from bimfit.config import FitConfig, SensorConfig
+from bimfit.estimation.components import reshaped
 from bimfit.estimation.cut_edges import cut_off, odds_of_cut_edges
-from bimfit.estimation.station import estimate_station, reshaped
+from bimfit.estimation.station import estimate_station
 from bimfit.geometry.pose import Pose2D
 from bimfit.geometry.profile import Profile
 

@@ -12,8 +12,9 @@ import pytest
 
 from bimfit.config import FitConfig, SensorConfig
 from bimfit.errors import ConfigError
+from bimfit.estimation.context import typical_range
 from bimfit.estimation.noise import estimate_noise
-from bimfit.estimation.station import estimate_station, typical_range
+from bimfit.estimation.station import estimate_station
 from bimfit.geometry.slice import Slice
 from bimfit.simulation.rangefinder import measured
 from bimfit.simulation.scenario import Scenario

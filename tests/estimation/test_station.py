@@ -123,7 +123,7 @@ def test_a_singular_matrix_is_a_rejection(monkeypatch):
     def singular(*_args, **_named):
         raise np.linalg.LinAlgError("Matrix is not positive definite.")
 
-    monkeypatch.setattr("bimfit.estimation.station.component_posterior", singular)
+    monkeypatch.setattr("bimfit.estimation.components.component_posterior", singular)
     sec = S.butt()
     slice_ = S.scan(np.random.default_rng(2), sec.components)
     result = estimate_station(sec, slice_, Pose2D(), SensorConfig(), FitConfig())
