@@ -91,6 +91,7 @@ def find_drafts(meshes: Sequence[TriangleMesh], eligible: NDArray[np.bool_], lim
         if leg.length >= limits.min_length - _ROUNDING and leg.depth >= limits.min_depth - _ROUNDING
     ]
     drafts = _finish(faces, rows) if rows else []
+    _lead_out(faces, rows, drafts)
     return [draft for draft in drafts if not draft.leg.groove or draft.kind in ("v-groove", "bevel")]
 
 
@@ -240,6 +241,19 @@ def _finish(faces: Faces, rows: Sequence[tuple[Key, Leg]]) -> list[Draft]:
         sides = sides[::-1] if flip[k] else sides
         out.append(Draft(key[0], key[1], key[2], key[3], str(shape.kind[k]), whole, path, sides))
     return out
+
+
+def _lead_out(faces: Faces, rows: Sequence[tuple[Key, Leg]], drafts: list[Draft]) -> None:
+    """Where a stepped section's leading faces lead nowhere, let those square to them lead, in ``drafts``.
+
+    A halving's bed may be larger than its cheeks, and between the cheeks is where it opens.
+    """
+    shut = [(k, rows[k][0], rows[k][1].square) for k, draft in enumerate(drafts) if not any(draft.free)]
+    turned = [(k, key, leg) for k, key, leg in shut if leg is not None]
+    if turned:
+        for (k, *_), draft in zip(turned, _finish(faces, [row[1:] for row in turned]), strict=True):
+            if any(draft.free):
+                drafts[k] = draft
 
 
 def _lead(legs: Sequence[Leg], u: Array, v: Array) -> Array:

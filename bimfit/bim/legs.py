@@ -57,6 +57,8 @@ class Leg:
         Found as a pair of prepared edges without a root land.
     lips : tuple of three Lip, optional
         Of a stepped section: the outermost faces against its side, the leading ones, and those towards it.
+    square : Leg, optional
+        The same stepped section, led by the largest of its faces that are square to the leading ones.
     """
 
     points: Array
@@ -71,6 +73,7 @@ class Leg:
     closed: bool = False
     groove: bool = False
     lips: tuple[Lip, Lip, Lip] | None = None
+    square: Leg | None = None
 
     @cached_property
     def way(self) -> Array:

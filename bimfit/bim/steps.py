@@ -34,8 +34,18 @@ def join_steps(legs: list[Leg]) -> list[Leg]:
                     taken[j] = True
                     group.append(legs[j])
                     queue.append(j)
-        out.append(_stepped(main, group))
+        out.append(replace(_stepped(group), square=_square(group)))
     return out
+
+
+def _square(group: Sequence[Leg]) -> Leg | None:
+    """The section led by the largest of the strips that are not parallel to the first, if there is one."""
+    across = group[0].u[0]
+    rest = [leg for leg in group if abs(float(leg.u[0] @ across)) <= _FACING]
+    if not rest:
+        return None
+    lead = max(rest, key=lambda leg: leg.area)
+    return _stepped([lead, *(leg for leg in group if leg is not lead)])
 
 
 def _steps(a: Leg, b: Leg) -> bool:
@@ -55,11 +65,12 @@ def _steps(a: Leg, b: Leg) -> bool:
     return float(np.linalg.norm(apart, axis=2).min()) < 1.5 * max(abs(a.gap), abs(b.gap)) + 5e-3
 
 
-def _stepped(main: Leg, group: Sequence[Leg]) -> Leg:
-    """The section of a group: the spine in the main strip's gap, midway in the whole depth.
+def _stepped(group: Sequence[Leg]) -> Leg:
+    """The section of a group, led by its first: the spine in that strip's gap, midway in the whole depth.
 
     The gap is the narrowest of the strips parallel to the main one, as that between the lands of a groove.
     """
+    main = group[0]
     if len(group) == 1:
         return main
     side, across = main.side, main.u[0]
