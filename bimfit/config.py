@@ -11,11 +11,12 @@ import math
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_type_hints
+from typing import Any, Literal, TypeVar, get_args, get_type_hints
 
 from bimfit.errors import ConfigError
 
 Bound = Literal["majorant", "overlap", "block"]
+Missing = Literal["gap", "unknown"]
 Triple = tuple[float, float, float]
 T = TypeVar("T")
 
@@ -50,10 +51,14 @@ class SensorConfig:
     outlier_share, miss_share : float
         Share of beams that return from something else, and of beams that meet the
         component but return nothing.
+    outlier_run : float
+        How many neighbouring beams such strays take on average: 1 alone, 4 of a sensor that sees streaks of
+        glare or ghosts. A run of them is then no sign of another shape, nor of something behind.
     max_range : float
         Farthest range the sensor reports, m.
-    missing_means_gap : bool
-        Whether a beam that returned nothing is evidence that nothing is there.
+    missing : {"gap", "unknown"}
+        What a beam says that returned nothing: that hardly anything can be there, or nothing at all, as on
+        shiny or dark surfaces. Returns from far behind say that nothing is there either way.
     adapt : bool
         Whether sigma, the shares and the correlation of neighbouring beams are estimated anew from each
         joint's residuals.
@@ -65,8 +70,9 @@ class SensorConfig:
     correlation: float = 0.0
     outlier_share: float = 0.01
     miss_share: float = 0.01
+    outlier_run: float = 1.0
     max_range: float = 5.6
-    missing_means_gap: bool = True
+    missing: Missing = "gap"
     adapt: bool = True
 
     def __post_init__(self) -> None:
@@ -76,6 +82,10 @@ class SensorConfig:
             if not (math.isfinite(value) and value >= 0.0):
                 raise ConfigError(f"{name} must be a number of at least 0, got {value}")
         _share(self, "outlier_share", "miss_share", "correlation")
+        if not 1.0 <= self.outlier_run <= 100.0:
+            raise ConfigError(f"outlier_run must lie in [1, 100], got {self.outlier_run}")
+        if self.missing not in get_args(Missing):
+            raise ConfigError(f"missing is one of {', '.join(get_args(Missing))}; got {self.missing}")
 
     def growth(self, distance: float) -> float:
         """How many times sigma a range of that length, m, deviates."""

@@ -12,7 +12,7 @@ import typer
 from bimfit.cli.choosing import choosing
 from bimfit.cli.limits import HELP as LIMITS_HELP
 from bimfit.cli.limits import read_limits
-from bimfit.cli.options import build_config
+from bimfit.cli.options import MISSING_HELP, build_config
 from bimfit.cli.placing import placing
 from bimfit.cli.progress import terminal_progress
 from bimfit.errors import ConfigError
@@ -59,6 +59,7 @@ def run(
         None, "--thickness", help="Thickness of a cloud's slices, such as 10mm."
     ),
     sigma: str | None = typer.Option(None, "--sigma", help="The sensor's range noise, such as 3mm."),
+    missing: str | None = typer.Option(None, "--missing", metavar="gap|unknown", help=MISSING_HELP),
     shape: str | None = typer.Option(
         None,
         "--shape",
@@ -96,6 +97,7 @@ def run(
         spacing=spacing,
         thickness=thickness,
         sigma=sigma,
+        missing=missing,
         shape=shape,
     )
     wanted = Deliverables(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from bimfit.cli.interrupts import stoppable
-from bimfit.cli.options import angle, build_config, length, read_pose
+from bimfit.cli.options import MISSING_HELP, angle, build_config, length, read_pose
 from bimfit.cli.options import speed as read_speed
 from bimfit.errors import ConfigError
 
@@ -55,6 +55,7 @@ def run(
     field: str = typer.Option("30deg", "--field", help="Half opening about straight ahead that is measured."),
     sweeps: int | None = typer.Option(None, "--sweeps", metavar="N", min=1, help="End after so many sweeps."),
     sigma: str | None = typer.Option(None, "--sigma", help="The sensor's range noise, such as 3mm."),
+    missing: str | None = typer.Option(None, "--missing", metavar="gap|unknown", help=MISSING_HELP),
     config: Path | None = typer.Option(None, "--config", metavar="FILE.toml", help="Settings."),
     as_json: bool = typer.Option(False, "--json", help="Print a JSON object a sweep."),
 ) -> int:
@@ -76,7 +77,7 @@ def run(
         flip,
         mirrored,
     )
-    settings = build_config(config, sigma=sigma)
+    settings = build_config(config, sigma=sigma, missing=missing)
     half = angle(field, "--field")
     if replay is not None and port is not None:
         raise ConfigError("--replay and --port exclude one another", remedy="give one of them")

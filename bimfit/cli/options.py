@@ -82,6 +82,9 @@ def _quantity(text: str, option: str, units: dict[str, float], example: str) -> 
     return float(found.group(1)) * units[found.group(2)]
 
 
+MISSING_HELP = "What a beam says that returned nothing: gap (default), or unknown, as on shiny surfaces."
+
+
 def build_config(
     file: Path | None,
     *,
@@ -90,6 +93,7 @@ def build_config(
     spacing: str | None = None,
     thickness: str | None = None,
     sigma: str | None = None,
+    missing: str | None = None,
     shape: str | None = None,
 ) -> Config:
     """Settings from a TOML file, with what the command line says on top.
@@ -111,6 +115,8 @@ def build_config(
         slices = dataclasses.replace(slices, thickness=length(thickness, "--thickness"))
     if sigma:
         sensor = dataclasses.replace(sensor, sigma=length(sigma, "--sigma"), adapt=False)
+    if missing:
+        sensor = dataclasses.replace(sensor, missing=missing)  # type: ignore[arg-type]  # checked there
     freedoms = shape_config(shape, config.shape) if shape else config.shape
     return dataclasses.replace(config, search=search, slices=slices, sensor=sensor, shape=freedoms)
 

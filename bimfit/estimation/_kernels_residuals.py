@@ -15,7 +15,13 @@ Mask = NDArray[np.bool_]
 
 GRAZING = 0.3
 ENDS = 6
-FIGURES = 14
+FIGURES = 22
+DOZEN = 12
+"""A face with more returns than that holds, whatever else is lost on it."""
+LEAST = 4
+_RARE = 7.6
+"""-log of a chance of 1 in 2,000."""
+_FALSE = 0.4
 
 
 @jit
@@ -70,6 +76,7 @@ def residuals(
     spacing: float,
     sigma: float,
     spread: Array,
+    sensor: Array,
     out: Array,
     z: Array,
     places: Array,
@@ -89,9 +96,14 @@ def residuals(
         What each range deviates by, m; residuals are brought to ``sigma``.
     used : (n,)
         Beams that speak for it; cleared where the other hides it.
+    sensor : (3,)
+        Share of beams that return nothing or from elsewhere, how many neighbours do so together, and the
+        greatest standard deviation, m, that a direction of the pose may have and still be fixed.
     out : (FIGURES,) out
         Beams, covered, inliers, rms, chi2, outlier share, miss share, their longest runs, cumulated
-        range, lag 1, unexplained, edge; in the order of :class:`~bimfit.estimation.result.Residuals`.
+        range, lag 1, unexplained, edge; in the order of :class:`~bimfit.estimation.result.Residuals`; then
+        excused returns, and of a face that the pose depends on without support: the edge (-1: none), its
+        beams and inliers, and the direction that depends on it, in (u, v, theta * radius).
     z, places, faces : (n,), (n, 2), (n,) out
         Residuals and places of the inliers, and the edge of each.
 
@@ -103,6 +115,7 @@ def residuals(
     n = r.shape[0]
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     stray, missed = np.empty(n, np.bool_), np.empty(n, np.bool_)
+    held = np.zeros((edges.shape[0], 3), np.int64)
     beams = covered = quiet_all = quiet = count = strays = misses = 0
     for q in range(eye.shape[0]):
         for k in range(start[q], start[q + 1]):
@@ -128,6 +141,10 @@ def residuals(
             strays += int(stray[covered])
             misses += int(missed[covered])
             covered += 1
+            if c < -GRAZING:
+                held[e, 0] += 1
+                held[e, 1] += int(inlier)
+                held[e, 2] += int(r[k] > 0.0 and not inlier)
             if inlier:
                 z[count], faces[count] = misfit * (sigma / own), e
                 places[count, 0] = eye[q, 0] + d[0, k] * r[k]
@@ -153,7 +170,88 @@ def residuals(
     out[11] = _continues(rho, face, used, r, start, spacing, sigma)
     out[12] = _edge_drop(z[:count], faces[:count], edges.shape[0], sigma)
     out[13] = quiet_all
+    out[14] = -1.0
+    doubted = _least_supported(held, sensor[0], sensor[1])
+    if doubted >= 0 and _depends(
+        edges, cos, sin, pivot, rho, face, used, d, r, start, eye, spread, doubted, sensor[2], out[17:]
+    ):
+        out[14], out[15], out[16] = doubted, held[doubted, 0], held[doubted, 1]
     return count
+
+
+@jit
+def _least_supported(held: Ints, lost: float, together: float) -> int:
+    """The face whose lost returns are least likely to be chance, -1 where all are likely enough.
+
+    Few returns on a face say that it is there as long as what is missing or false among them is what the
+    sensor loses anyway. The chance of x lost of n is at most exp(-n KL(x / n | share)) (Chernoff); what is
+    lost in runs counts once a run. ``held`` (m, 3): beams, inliers and strays a face.
+    """
+    worst, found = _RARE, -1
+    for e in range(held.shape[0]):
+        n, good, strays = held[e, 0], held[e, 1], held[e, 2]
+        if n < LEAST or good > DOZEN:
+            continue
+        x = (n - good) / n
+        if x > lost:
+            gain = x * math.log(x / lost)
+            if x < 1.0:
+                gain += (1.0 - x) * math.log((1.0 - x) / (1.0 - lost))
+            surprise = n * gain / together
+            if together > 1.0 and good < _FALSE * (good + strays):
+                surprise += _RARE
+            if surprise > worst:
+                worst, found = surprise, e
+    return found
+
+
+@jit
+def _depends(
+    edges: Array, cos: float, sin: float, pivot: Array, rho: Array, face: Ints, used: Mask, d: Array,
+    r: Array, start: Ints, eye: Array, spread: Array, doubted: int, most: float, axis: Array,
+) -> bool:  # fmt: skip
+    """Whether the returns on all other faces leave a direction open that the face ``doubted`` would fix.
+
+    By Fisher information of ranges (METHOD, section 5): of the others' returns, and of all the beams that
+    should meet the face. ``axis`` (3 or more,) gets the direction.
+    """
+    rest, own = np.zeros((3, 3)), np.zeros((3, 3))
+    g = np.empty(3)
+    square, count = 0.0, 0
+    for both in range(2):
+        radius = math.sqrt(square / max(count, 1)) if both else 1.0
+        for q in range(eye.shape[0]):
+            for k in range(start[q], start[q + 1]):
+                e = face[k]
+                if not used[k] or e < 0:
+                    continue
+                nx = cos * edges[e, 4] - sin * edges[e, 5]
+                ny = sin * edges[e, 4] + cos * edges[e, 5]
+                c = nx * d[0, k] + ny * d[1, k]
+                if c > -GRAZING:
+                    continue
+                x, y = eye[q, 0] + d[0, k] * rho[k] - pivot[0], eye[q, 1] + d[1, k] * rho[k] - pivot[1]
+                if not both:
+                    square, count = square + x * x + y * y, count + 1
+                    continue
+                g[0], g[1], g[2] = nx / c, ny / c, (ny * x - nx * y) / (c * radius)
+                for i in range(3):
+                    for j in range(3):
+                        add = g[i] * g[j] / (spread[k] * spread[k])
+                        if e == doubted:
+                            own[i, j] += add
+                        elif r[k] > 0.0 and abs(r[k] - rho[k]) < 4.0 * spread[k]:
+                            rest[i, j] += add
+    if count == 0:
+        return False
+    values, axes = np.linalg.eigh(rest)
+    least = 1.0 / (most * most)
+    axis[0], axis[1], axis[2] = axes[0, 0], axes[1, 0], axes[2, 0]
+    would = 0.0
+    for i in range(3):
+        for j in range(3):
+            would += axis[i] * own[i, j] * axis[j]
+    return values[0] < least and would > least
 
 
 @jit

@@ -12,7 +12,7 @@ from bimfit.estimation.posterior import Posterior, Window
 from bimfit.estimation.result import ComponentEstimate, Residuals, Rival, StationEstimate
 from bimfit.estimation.slide import SlideResult
 from bimfit.geometry.joint_section import JointSection
-from bimfit.geometry.pose import Pose2D
+from bimfit.geometry.pose import Array, Pose2D
 from bimfit.geometry.status import OK, Status
 
 _RIVAL_ODDS = -4.0
@@ -28,7 +28,10 @@ _CONTINUES = 4
 _EDGE = 4.2
 _BY_CHANCE = 0.05
 _FIXED_BY_HITS = 0.001
+FIXED = 0.3
+"""A direction is fixed where its standard deviation is under that share of the prior's."""
 _TURNED = 3.0
+_ON_CHAIN = 1e-6
 
 
 def judge_station(
@@ -47,8 +50,8 @@ def judge_station(
 ) -> StationEstimate:
     """Put a station together and say what may be believed of it."""
     made = [
-        replace(_component(p, r, slid.pose, window, sensor, fit), corner_step=step)
-        for p, r, step in zip(posteriors, residuals, steps, strict=True)
+        replace(_component(section, which, p, r, slid.pose, window, sensor, fit), corner_step=step)
+        for which, (p, r, step) in enumerate(zip(posteriors, residuals, steps, strict=True))
     ]
     components = (made[0], made[1])
     covered = sum(r.n_covered for r in residuals)
@@ -84,12 +87,17 @@ def with_rival(station: StationEstimate, odds: float) -> StationEstimate:
 
 
 def _component(
-    posterior: Posterior | None, residuals: Residuals, prior: Pose2D, window: Window, sensor: SensorConfig,
-    fit: FitConfig,
+    section: JointSection, which: int, posterior: Posterior | None, residuals: Residuals, prior: Pose2D,
+    window: Window, sensor: SensorConfig, fit: FitConfig,
 ) -> ComponentEstimate:  # fmt: skip
     if posterior is None:
         return ComponentEstimate(status=Status("no_data", "hardly any return lies on the component"))
     status, weak = _component_status(posterior, residuals, prior, window, fit, sensor)
+    if status.name == "ok" and residuals.unsupported is not None:
+        face = residuals.unsupported
+        weak = _direction(face.direction)
+        where = f"return from {_face_name(section, which, face.face)}, without which nothing fixes it {weak}"
+        status = Status("weak", f"only {face.inliers} of {face.beams} beams {where}")
     rivals: tuple[Rival, ...] = ()
     if posterior.rival_mass > _WORTH_NAMING:
         du, dv = posterior.rival_offset * posterior.weak_axis[:2]
@@ -117,7 +125,8 @@ def _component_status(
         return Status("rejected", f"only {share} return from it"), ""
     # the longest run by chance among so many beams is seldom longer than this
     rare = math.log(1e-3 / max(r.n_covered, 1))
-    lost, strayed = (rare / math.log(max(share, 0.05)) for share in (sensor.miss_share, sensor.outlier_share))
+    goes_on = max(sensor.outlier_share, 1.0 - 1.0 / sensor.outlier_run)
+    lost, strayed = (rare / math.log(max(share, 0.05)) for share in (sensor.miss_share, goes_on))
     if r.miss_run >= max(_RUN, lost) or r.outlier_run >= max(_RUN, strayed):
         what = "return nothing" if r.miss_run >= r.outlier_run else "return from elsewhere"
         run = max(r.miss_run, r.outlier_run)
@@ -134,8 +143,8 @@ def _component_status(
         return Status("rejected", f"it lies {where}, more than the placement tolerance allows"), ""
     if r.n_inliers <= _DOZEN:
         return Status("weak", f"only {r.n_inliers} returns support it: too few to tell its shape"), ""
-    if posterior.weak_sd > 0.3 * window.shift:
-        weak = _direction(posterior)
+    if posterior.weak_sd > FIXED * window.shift:
+        weak = _direction(posterior.weak_axis)
         sd = f"standard deviation {posterior.weak_sd * 1e3:.1f} mm"
         return Status("weak", f"the data do not fix it {weak}: {sd}"), weak
     if posterior.rival_mass > _RIVAL_MASS:
@@ -170,18 +179,32 @@ def _joint_status(
         return Status(
             "weak", "no beam passes between the components: the gap is narrower than the beams' spacing"
         )
+    silent = sensor.missing == "unknown"
+    if passed == 0 and silent:
+        reason = "no return comes from between the components, and missing returns say nothing of this sensor"
+        return Status("weak", reason)
     if passed == 0:
         return Status("weak", "no beam passes between the components: closed, filled, or not a gap at all")
     # a gap that would be far narrower than designed is the more likely one that chance misses have made
     doubt = _BY_CHANCE if widened > -0.5 * float(np.hypot(*designed)) else 0.1 * _BY_CHANCE
-    if passed and covered * max(sensor.miss_share, 1e-3) ** passed > doubt:
+    chance = max(sensor.outlier_share if silent else sensor.miss_share, 1e-3)
+    if passed and covered * chance**passed > doubt:
         beams_pass = "1 beam passes" if passed == 1 else f"{passed} beams pass"
         return Status("weak", f"only {beams_pass} between the components: too few to tell from drop-outs")
     return OK
 
 
-def _direction(posterior: Posterior) -> str:
-    """Name of the weak direction in words."""
-    a = np.abs(posterior.weak_axis)
+def _direction(axis: Array) -> str:
+    """Name in words of a direction (3,) in (u, v, theta * radius)."""
     names = ("across the gap (u)", "out of the mouth (v)", "in rotation")
-    return names[int(np.argmax(a))]
+    return names[int(np.argmax(np.abs(axis)))]
+
+
+def _face_name(section: JointSection, which: int, face: int) -> str:
+    """What a face of a component's profile is, in words."""
+    chain = section.gap.side_a if which == 0 else section.gap.side_b
+    middle = section.components[which].edges[face].mean(axis=0)
+    a, way = chain[:-1], np.diff(chain, axis=0)
+    t = ((middle - a) * way).sum(axis=1) / np.maximum((way * way).sum(axis=1), 1e-300)
+    away = np.linalg.norm(a + np.clip(t, 0.0, 1.0)[:, None] * way - middle, axis=1)
+    return "its face in the gap" if float(away.min()) < _ON_CHAIN else "one of its outer faces"

@@ -137,7 +137,8 @@ def _residuals(
         return Residuals()
     return residuals_of(
         context.rows[which], posterior, context.beams, (scene.rho[which], scene.face[which]),
-        scene.rho[1 - which], (side == which) & usable, context.sensor.sigma,
+        scene.rho[1 - which], (side == which) & usable, context.sensor,
+        checks.FIXED * context.window.shift,
     )  # fmt: skip
 
 

@@ -85,21 +85,24 @@ def station_context(
     section: JointSection, slice_: Slice, combined: Pose2D, sensor: SensorConfig, fit: FitConfig
 ) -> tuple[Context, str]:
     """What every step needs, and why a hole between points is no evidence (empty where it is)."""
-    virtual = None
+    virtual, reason = None, ""
     own, (sensor, distance) = sensor, sensor_here(sensor, slice_)
     if slice_.beams is None or len(slice_.beams.ranges) == 0:
         virtual = virtual_beams(slice_, combined)
         beams = BeamSet.of(virtual.beams)
-        if not virtual.spacing_known:
+        if not virtual.spacing_known and sensor.missing == "gap":
+            reason = virtual.reason
             sensor = irregular_sensor(sensor)
     else:
         beams = BeamSet.of(slice_.beams)
+    if sensor.missing == "unknown":
+        beams = beams.take(beams.r > 0.0)
     rows = (edge_rows(section.components[0]), edge_rows(section.components[1]))
     grows = own.sigma_per_metre > 0.0
     expected = Scene.at(rows, (combined, combined), beams).nearest if grows else None
     beams = with_spread(beams, own, distance, expected)
     context = Context(section, beams, rows, BeamModel.of(sensor), sensor, fit, virtual is not None)
-    return context, virtual.reason if virtual else ""
+    return context, reason
 
 
 def sensor_here(sensor: SensorConfig, slice_: Slice) -> tuple[SensorConfig, float]:

@@ -38,7 +38,8 @@ class BeamModel:
     miss : float
         log(e_m / (1 - e_m - e_o)): what a beam that returned nothing says against a face in its way.
     past : float
-        The same for a beam that went past and returned from behind.
+        The same for a beam that went past and returned from behind; where strays come in runs, one of them
+        counts no more than once.
     """
 
     sigma: float
@@ -60,8 +61,12 @@ def _model(sensor: SensorConfig, sigma: float | None, outliers: float | None) ->
     e_o = max(sensor.outlier_share if outliers is None else outliers, _SHARE_FLOOR)
     e_m = max(sensor.miss_share, _SHARE_FLOOR)
     amplitude = max(1.0 - e_o - e_m, 0.05) * sensor.max_range / (e_o * s * math.sqrt(2.0 * math.pi))
-    past = min(math.log(e_m / max(1.0 - e_m - e_o, 0.05)), 0.0)
-    return BeamModel(s, amplitude, past if sensor.missing_means_gap else 0.0, past)
+    there = max(1.0 - e_m - e_o, 0.05)
+    miss = min(math.log(e_m / there), 0.0)
+    past = miss
+    if sensor.outlier_run > 1.0:
+        past = max(miss, min(math.log(e_o / there), 0.0) / sensor.outlier_run)
+    return BeamModel(s, amplitude, miss, past)
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,9 @@ _SHARE_PRIOR = 30.0
 """Beams' worth of the shares that were assumed."""
 _GATE = 4.0
 """A return that many assumed sigmas away is no inlier, see :mod:`bimfit.estimation.residuals`."""
+_CORE, _BACKGROUND, _CLEARLY = 2.5, 0.02, 8.0
+"""Where more than that share of the inliers is background (by that much log-likelihood), only those within so
+many of the core's sigmas count."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,8 @@ class _Sums:
     def add(self, c: ComponentEstimate, z: Array, gate: float) -> None:
         """Count one component's residuals ``z``, m, none of which is over ``gate``."""
         n, r = len(z), c.residuals
+        if n < _LEAST:
+            return
         self.squares += float(z @ z)
         self.products += float(z[1:] @ z[:-1])
         self.power += float(z[1:] @ z[1:] + z[:-1] @ z[:-1]) / 2.0
@@ -78,7 +83,7 @@ class _Sums:
         self.pair_fits += _PARAMETERS * (n - 1) / n
         self.count += n
         self.covered += r.n_covered
-        self.outliers += round(r.outlier_share * r.n_covered)
+        self.outliers += round(r.outlier_share * r.n_covered) + len(r.residuals) - n
         self.misses += round(r.miss_share * r.n_covered)
 
 
@@ -94,9 +99,11 @@ def estimate_noise(estimates: Sequence[StationEstimate], sensor: SensorConfig) -
     sensor : SensorConfig
         What was assumed; returned unchanged where there are hardly any residuals.
     """
+    parts = list(_seen(estimates))
+    core = _core([(z, gate) for _, z, gate in parts])
     sums = _Sums()
-    for c, z, gate in _seen(estimates):
-        sums.add(c, z, gate)
+    for c, z, gate in parts:
+        sums.add(c, z[np.abs(z) <= core * gate], core * gate)
     if sums.count < _FEW or sums.power <= 0.0:
         return Noise(
             sensor.sigma, sensor.outlier_share, sensor.miss_share, sensor.correlation, sums.count, sensor
@@ -130,6 +137,29 @@ def _seen(estimates: Sequence[StationEstimate]) -> Iterator[tuple[ComponentEstim
             z = c.residuals.residuals / station.growth
             if c.posterior is not None and c.status.measured and len(z) >= _LEAST:
                 yield c, z, _GATE * station.sensor.sigma / station.growth
+
+
+def _core(parts: Sequence[tuple[Array, float]]) -> float:
+    """Share of the gate within which residuals are noise: 1 unless a background of strays lies under them.
+
+    A normal cut off at the gate and a uniform background under it, by maximum likelihood from a histogram.
+    A background within four sigmas would pass for noise, and the wider gate of the next round let in more.
+    """
+    if not parts:
+        return 1.0
+    x = np.concatenate([np.abs(z) / gate for z, gate in parts])
+    edges = np.linspace(0.0, 1.0, 33)
+    counts = np.histogram(x, edges)[0]
+    sigmas = np.geomspace(0.02, 2.0, 70)
+    inside = np.array([[math.erf(e / (s * math.sqrt(2.0))) for e in edges] for s in sigmas.tolist()])
+    normal = np.diff(inside, axis=1) / inside[:, -1:]
+    shares = np.linspace(0.0, 0.7, 36)
+    mixed = (1.0 - shares)[:, None, None] * normal + shares[:, None, None] / len(counts)
+    value = np.log(np.maximum(mixed, 1e-300)) @ counts
+    alone, best = float(value[0].max()), np.unravel_index(int(np.argmax(value)), value.shape)
+    if shares[best[0]] <= _BACKGROUND or float(value.max()) < alone + _CLEARLY:
+        return 1.0
+    return min(_CORE * float(sigmas[best[1]]), 1.0)
 
 
 def _moments(sums: _Sums) -> tuple[float, float]:

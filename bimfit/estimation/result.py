@@ -14,6 +14,26 @@ from bimfit.geometry.status import OK, Status
 
 
 @dataclass(frozen=True)
+class Unsupported:
+    """A face that a direction of the pose depends on, and that hardly a return bears out.
+
+    Attributes
+    ----------
+    face : int
+        Edge of the component's profile.
+    beams, inliers : int
+        Beams that should meet it, and those that return from it.
+    direction : ndarray, shape (3,)
+        What the other faces leave open, in (u, v, theta * radius).
+    """
+
+    face: int
+    beams: int
+    inliers: int
+    direction: Array
+
+
+@dataclass(frozen=True)
 class Residuals:
     """How the returns of one component agree with its estimate.
 
@@ -41,6 +61,8 @@ class Residuals:
         Residuals in range, m, and where the returns lie in the section.
     faces : ndarray, shape (n_inliers,)
         The edge of the component's profile that each should have met.
+    unsupported : Unsupported or None
+        A face without which the pose is not fixed and that the returns do not bear out.
     """
 
     n_beams: int = 0
@@ -59,6 +81,7 @@ class Residuals:
     residuals: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     places: Array = field(default_factory=lambda: np.zeros((0, 2)), repr=False)
     faces: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64), repr=False)
+    unsupported: Unsupported | None = None
 
 
 @dataclass(frozen=True)

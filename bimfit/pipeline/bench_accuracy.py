@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from bimfit.config import Config
+from bimfit.config import Config, SensorConfig
 from bimfit.errors import ConfigError
 from bimfit.geometry.pose import Array
 from bimfit.pipeline.accuracy import accuracy_table, joint_errors, table_text
@@ -24,6 +24,7 @@ from bimfit.pipeline.simulate import designed, longest_open
 from bimfit.pipeline.survey import cut_joint, model_joints
 from bimfit.pipeline.targets import TargetCache
 from bimfit.simulation.accuracy import GapErrors, gap_errors
+from bimfit.simulation.disturbance import Disturbance
 from bimfit.simulation.motion import random_truth
 from bimfit.simulation.oracle import oracle_gap
 from bimfit.simulation.rangefinder import simulate_scan
@@ -35,6 +36,8 @@ REFERENCE = "square-butt-ifc4.ifc"
 _FAR = 0.005
 _NORMAL = 1.96
 _TIMED = 2
+SPOILT = Config(sensor=SensorConfig(outlier_share=0.2, outlier_run=4.0))
+"""A sensor of which it is known that it sees streaks of false points."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,8 @@ class Case:
         How many seeded joints.
     asked : dict of str to str
         For each motion model that is run, what the project asks for.
+    config : Config
+        What is known of the sensor.
     """
 
     name: str
@@ -56,6 +61,7 @@ class Case:
     scenario: Scenario
     joints: int
     asked: dict[str, str]
+    config: Config = field(default_factory=Config)
 
 
 def cases(joints: int) -> tuple[Case, ...]:
@@ -76,6 +82,15 @@ def cases(joints: int) -> tuple[Case, ...]:
         *(
             Case(name, f"{name}.ifc", Scenario(), 1 if name == "curved" else sample, both)
             for name in ("v-groove", "lap", "mitre", "t-joint", "curved")
+        ),
+        *(
+            Case(f"{part}, {what}", model, Scenario(disturbance=how), sample, both, SPOILT)
+            for part, model in (("reference", REFERENCE), ("v-groove", "v-groove.ifc"))
+            for what, how in (
+                ("streaks 20 %", Disturbance(glare=0.2)),
+                ("ghosts 20 %", Disturbance(ghosts=0.2)),
+                ("faces lost", Disturbance(bursts=0.3)),
+            )
         ),
     )
 
@@ -179,12 +194,12 @@ def bench_accuracy(
     for case in every:
         tallies = {motion: Tally() for motion in case.asked}
         oracle, paper = Tally(), Tally()
-        cache = TargetCache(Config())
+        cache = TargetCache(case.config)
         outlines = TargetCache(Config(), outlines=True)
         for k, (truth, cut) in enumerate(_simulated(case, seed)):
             progress(case.name, done / total)
             done += 1
-            fitted = fit_slices(cut[1], cut[2], Config(), cache, threads=1)
+            fitted = fit_slices(cut[1], cut[2], case.config, cache, threads=1)
             for motion, tally in tallies.items():
                 tally.add(fit_along(cut[0], fitted, motion), truth)
             if case.name == "reference":

@@ -15,6 +15,7 @@ from bimfit.geometry.line_scan import LineScan
 from bimfit.geometry.pose import Array
 from bimfit.geometry.profile import Profile
 from bimfit.simulation.aim import open_direction
+from bimfit.simulation.disturbance import Disturber
 from bimfit.simulation.scenario import Scenario
 from bimfit.simulation.truth import JointTruth
 
@@ -80,7 +81,8 @@ def simulate_scan(
     The sensor is where the plan has it: ``sensor_height`` from the designed mouth, looking at it; straight
     over a butt joint, half way between the faces of a corner (:func:`aim`), wherever
     the components have really gone. Ranges get noise N(0, sigma), correlated from beam to
-    beam if asked; then returns get lost, and beams return from anywhere in range instead.
+    beam if asked; then returns get lost, and beams return from anywhere in range instead; last comes what
+    else goes wrong (:mod:`bimfit.simulation.disturbance`).
 
     Parameters
     ----------
@@ -108,6 +110,7 @@ def simulate_scan(
     eye, directions = _view(out, scenario, bearings)
     starts = np.broadcast_to(eye, directions.shape)
     origins, rays, ranges = [], [], []
+    spoil = Disturber(scenario.disturbance, scenario.sigma, seed) if scenario.disturbance else None
     for section, station in zip(sections, truth.stations, strict=True):
         moved = [p.moved(pose) for p, pose in zip(section.components, station.components, strict=True)]
         if any(inside(profile, eye) for profile in moved):
@@ -115,7 +118,12 @@ def simulate_scan(
                 f"the sensor would stand inside a component at station {station.s:.3f} m of joint {truth.id}",
                 remedy="choose another sensor_height",
             )
-        ranges.append(measured(cast(moved, starts, directions).ranges, scenario, rng))
+        seen = cast(moved, starts, directions)
+        sweep = measured(seen.ranges, scenario, rng)
+        if spoil is not None:
+            copies = [p.moved(spoil.ghost) for p in moved]
+            sweep = spoil.spoiled(sweep, seen, cast(copies, starts, directions).ranges)
+        ranges.append(sweep)
         o, d = _to_world(section.frame, starts, directions)
         origins.append(o)
         rays.append(d)

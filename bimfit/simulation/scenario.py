@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -13,6 +13,7 @@ import numpy as np
 from bimfit.config import from_dict
 from bimfit.errors import ConfigError
 from bimfit.geometry.pose import Array
+from bimfit.simulation.disturbance import Disturbance
 
 Motion = Literal["piecewise", "none", "const", "rigid", "linear", "bent"]
 
@@ -57,6 +58,8 @@ class Scenario:
         Share of beams that return from anywhere in range, and share of returns that are lost.
     min_range, max_range : float
         What the sensor can report, m.
+    disturbance : Disturbance
+        What else goes wrong: glare, ghosts, mixed pixels, spikes, bursts.
     """
 
     motion: Motion = "piecewise"
@@ -79,6 +82,7 @@ class Scenario:
     dropouts: float = 0.0
     min_range: float = 0.020
     max_range: float = 5.6
+    disturbance: Disturbance = field(default_factory=Disturbance)
 
     def __post_init__(self) -> None:
         if self.motion not in get_args(Motion):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import sys
 from pathlib import Path
@@ -62,3 +63,23 @@ def test_one_station_says_what_it_can():
 def test_too_few_residuals_change_nothing():
     sensor = SensorConfig(sigma=0.004)
     assert estimate_noise([], sensor).sensor == sensor
+
+
+def test_streaks_among_the_inliers_do_not_pass_for_noise():
+    """A fifth of the returns lie 2 to 6 sigmas off: the core's sigma comes back, and no runaway follows."""
+    sensor = SensorConfig(outlier_share=0.1, outlier_run=4.0)
+    sec = S.butt()
+    rng = np.random.default_rng(8)
+    truth = S.reference_truth(rng, sec, n=30)
+    out = []
+    for a, b, c in zip(truth.a, truth.b, truth.common, strict=True):
+        slice_ = S.scan(rng, [sec.components[0].moved(a), sec.components[1].moved(b)])
+        false = rng.random(len(slice_.beams.ranges)) < 0.2
+        off = rng.choice([-1.0, 1.0], len(false)) * rng.uniform(0.006, 0.018, len(false))
+        beams = slice_.beams
+        beams = dataclasses.replace(beams, ranges=beams.ranges + np.where(false, off, 0.0))
+        slice_ = dataclasses.replace(slice_, beams=beams, points=beams.points)
+        out.append(estimate_station(sec, slice_, S.search_like(rng, c), sensor, FitConfig()))
+    noise = estimate_noise(out, sensor)
+    assert noise.sigma == pytest.approx(0.003, rel=0.15)
+    assert 0.12 < noise.outlier_share < 0.25

@@ -280,3 +280,17 @@ def test_damaged_maps_are_read_or_refused_but_never_crash(tmp_path, counts, name
         else:
             assert len(scan) > 0 and np.isfinite(scan.directions if isinstance(scan, LineScan) else 0).all()
     assert refused >= (3 if name in ("h.tif", "z.tif", "p.csv") else 10)
+
+
+def test_columns_that_the_sensor_does_not_use_are_no_beams(tmp_path, counts):
+    """Empty from the first row to the last at either end; a groove as long as the map stays a groove."""
+    counts[:, :3] = counts[:, -5:] = 0
+    from PIL import Image
+
+    Image.fromarray(counts).save(tmp_path / "h.png")
+    scan = read_scan(tmp_path / "h.png", options=PIXEL)
+    assert len(scan) == SHAPE[0] * (SHAPE[1] - 8)
+    lost = ~scan.returned.reshape(SHAPE[0], -1)
+    assert lost[0].sum() == 4
+    assert lost[7].all()
+    assert np.allclose(scan.hits, expected(counts), rtol=0, atol=1e-12)

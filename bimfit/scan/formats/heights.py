@@ -18,6 +18,8 @@ Floats = NDArray[np.floating]
 _LEAST_VIEW = 10.0
 """The eye is at least so many half diagonals away."""
 _LEAN = 5.0
+_ROWS = 8
+"""So many rows tell a column that is not used from one that chanced upon nothing."""
 _TAILS = (0.5, 99.5)
 
 
@@ -41,8 +43,12 @@ def beams_of_heights(
     -------
     LineScan
         With a sweep a row, and a beam a place; those without height aim at a height between their
-        neighbours' in the row.
+        neighbours' in the row. Columns at either end that are empty from the first row to the last are no
+        beams: the sensor does not use them.
     """
+    used = np.flatnonzero(np.isfinite(heights).any(axis=0))
+    if len(heights) >= _ROWS and len(used) < heights.shape[1]:
+        heights, xs = heights[:, used[0] : used[-1] + 1], xs[used[0] : used[-1] + 1]
     filled = _filled(heights)
     eye = _eye(heights, xs, ys)
     x, y = np.broadcast_arrays(xs[None, :], ys[:, None])
