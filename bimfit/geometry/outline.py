@@ -15,6 +15,7 @@ FACING = float(np.sin(np.radians(12.0)))
 _PARALLEL = float(np.cos(np.radians(5.0)))
 _CLASH = 0.020  # components that overlap by no more than this still have a gap outline, m
 _LEDGE = 0.030  # ledges up to this long, or 1.5 times the facing depth, belong to a stepped joint, m
+_BED = 0.060  # longer ones too, where the other component lies within this over their middle, m
 _STEP_GAP = 0.200  # behind a ledge, the other component must be within this, m
 _SAME = 2e-6
 
@@ -35,7 +36,8 @@ def trace_gap(profile_a: Profile, profile_b: Profile) -> GapOutline | None:
     - *Plates*: the boundary that bounds a chain at one end has an opposite face, which bounds it at the other
       end even if it faces the other component (the inside faces of a mitred corner).
     - *Steps*: a ledge that does not face the other component is followed where the boundary behind it faces
-      it again, with free sight on it (rebates, tongue and groove).
+      it again, with free sight on it (rebates, tongue and groove); a long one only as the bed of a halving,
+      with the other component over it.
     - *Overhangs*: where one chain goes on, in v, beyond the other's end by more than the gap is wide there
       (T, lap, corner, boards of unequal thickness), it is cut off at its point nearest to the other's end.
 
@@ -177,15 +179,33 @@ def _follow(own: _Boundary, first: int, step: list[int], other: _Boundary, depth
         edge = step[out[-1] if out else first]
         while edge != first and not own.faces(edge):
             ledge.append(edge)
-            if sum(own.size(e) for e in ledge) > max(_LEDGE, 1.5 * depth):
-                return out
             edge = step[edge]
         if edge == first or not _sees(own, edge, other):
+            return out
+        long = sum(own.size(e) for e in ledge) > max(_LEDGE, 1.5 * depth)
+        if long and not _is_bed(own, ledge, other, forward=step is own.following):
             return out
         more = [edge, *_facing_run(own, edge, step)]
         if first in more:
             return out
         out += [*ledge, *more]
+
+
+def _is_bed(own: _Boundary, ledge: list[int], other: _Boundary, *, forward: bool) -> bool:
+    """Whether the other component lies over the middle of a ledge, and near."""
+    stops = np.cumsum([own.size(edge) for edge in ledge])
+    k = int(np.searchsorted(stops, 0.5 * stops[-1]))
+    edge, left = ledge[k], float(stops[k] - 0.5 * stops[-1])
+    near, far = (own.end, own.start) if forward else (own.start, own.end)
+    foot = near[edge] + left / own.size(edge) * (far[edge] - near[edge])
+    normal, flip = own.normal[edge], np.array([-1.0, 1.0])
+    start, end = other.start * flip - foot, other.end * flip - foot
+    along = np.array([-normal[1], normal[0]])
+    a, b = start @ along, end @ along
+    cross = np.flatnonzero((a > 0.0) != (b > 0.0))
+    share = a[cross] / (a[cross] - b[cross])
+    away = (start[cross] + share[:, None] * (end[cross] - start[cross])) @ normal
+    return bool(((away > -_CLASH) & (away < _BED)).any())
 
 
 def _sees(own: _Boundary, edge: int, other: _Boundary) -> bool:
