@@ -163,8 +163,12 @@ class BeamSet:
     @property
     def points(self) -> Array:
         """Where each beam ended (nonsense for misses), shape (n, 2)."""
-        origin = np.repeat(self.eye[:, :2], np.diff(self.start), axis=0)
-        return np.asarray(origin + (self.d * self.r).T)
+        return np.asarray((self.origins + self.d * self.r).T)
+
+    @property
+    def origins(self) -> Array:
+        """Where each beam starts from, shape (2, n)."""
+        return np.repeat(self.eye[:, :2].T, np.diff(self.start), axis=1)
 
 
 def usual_step(step: Array) -> float:

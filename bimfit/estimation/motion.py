@@ -14,6 +14,7 @@ from bimfit.estimation import _kernels_knots as kernels
 from bimfit.estimation import trend
 from bimfit.estimation.borrow import FLAG, SHAKES, at_corner, borrow
 from bimfit.estimation.disagreement import disagreements
+from bimfit.estimation.pooled import pooled
 from bimfit.estimation.result import ComponentEstimate, StationEstimate
 from bimfit.estimation.trend import Basis, Sites, Trend
 from bimfit.geometry.joint_section import JointSection
@@ -24,6 +25,7 @@ Motion = Literal["independent", "const", "rigid", "linear", "smooth", "kinked", 
 _KEEP_KNOT = 30.0
 _KINKED_MARGIN = 20.0
 _FEW = 3
+_FEW_PARAMETERS = ("const", "rigid", "linear")
 _BOTH = 0.5
 """Stations that count for less than that, both components of them, have moved and are no outliers."""
 
@@ -136,28 +138,64 @@ def estimate_joint(
             freedom = 6.0 * len(knots) + 2.0 * (len(knots) - 2)
         count = sum(int(p.known.sum()) for p in parts)
         criterion[name] = sum(t.deviance for t in pair) + freedom * math.log(count)
-    chosen = _choose(criterion)
-    fitted = tuple(
-        trend.with_shared_cells(p, b, t) for p, b, t in zip(parts, bases[chosen], fits[chosen], strict=True)
-    )
+    chosen, fitted, final = _refined(stations, sections, parts, fits, bases, criterion)
     bent = knots if chosen == "kinked" else np.zeros(0)
-    apart = disagreements(stations, sections, parts, (fitted[0], fitted[1]), bent)
+    apart = disagreements(stations, sections, parts, fitted, bent)
     out, outliers = _apply(stations, sections, parts, apart)
     couplings = tuple(
         Coupling(b, t.spread, np.array([section.gap.mouth[which] for section in sections]))
-        for which, (b, t) in enumerate(zip(bases[chosen], fitted, strict=True))
+        for which, (b, t) in enumerate(zip(final, fitted, strict=True))
     )
     return JointEstimate(out, chosen, criterion, bent, outliers, (couplings[0], couplings[1]))
 
 
+def _refined(
+    stations: tuple[StationEstimate, ...],
+    sections: Sequence[JointSection],
+    parts: tuple[Sites, Sites],
+    fits: dict[str, tuple[Trend, Trend]],
+    bases: dict[str, tuple[Basis, Basis]],
+    criterion: dict[str, float],
+) -> tuple[str, tuple[Trend, Trend], tuple[Basis, Basis]]:
+    """The model chosen, its trends with all that beams tell of them, and their bases.
+
+    A motion of few parameters is judged by all beams at once; where they contradict it, another is chosen, if
+    there is one. In other motions the cells between beams are what stations share.
+    """
+    name = _choose(criterion)
+    trends: list[Trend] = []
+    used: list[Basis] = []
+    for which, sites in enumerate(parts):
+        basis = bases[name][which]
+        rough = trend.with_shared_cells(sites, basis, fits[name][which])
+        better = None
+        if name in _FEW_PARAMETERS:
+            bowed, start = trend.bowed(basis, rough, fits[name])
+            better, borne_out = pooled(stations, sections, which, sites, bowed, start)
+            others = {n: c for n, c in criterion.items() if n not in _FEW_PARAMETERS}
+            if not borne_out and others:
+                return _refined(stations, sections, parts, fits, bases, others)
+        trends.append(rough if better is None else better)
+        used.append(basis if better is None else bowed)
+    return name, (trends[0], trends[1]), (used[0], used[1])
+
+
 def _mostly_sound(stations: Sequence[StationEstimate]) -> bool:
-    """Whether at least half of the stations that are measured are ``ok``.
+    """Whether at least half of the stations that are measured are fixed in all directions.
 
     Where ranges leave a direction free at most stations, as in a lap that no beam looks into, they are no
-    Gaussian sites: a model built on them wanders off and does not know it.
+    Gaussian sites: a model built on them wanders off and does not know it. Doubt about a component's shape,
+    which is weak too, is no such reason.
     """
     measured = [e for e in stations if e.status.measured]
-    return 2 * sum(e.status.name == "ok" for e in measured) >= len(measured)
+    return 2 * sum(_fixed(e) for e in measured) >= len(measured)
+
+
+def _fixed(station: StationEstimate) -> bool:
+    if station.status.name == "ok":
+        return True
+    free = any(c.weak_direction for c in station.components)
+    return station.status.name == "weak" and station.through > 0 and not station.virtual and not free
 
 
 def _fit_pair(parts: tuple[Sites, Sites], bases: tuple[Basis, Basis]) -> tuple[Trend, Trend]:

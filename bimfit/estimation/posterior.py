@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -43,6 +43,29 @@ class Window:
 
 
 @dataclass(frozen=True)
+class Heard:
+    """The beams that spoke for a component, and what each of them says, so that others may hear them too.
+
+    Attributes
+    ----------
+    rows : ndarray, shape (m, 6)
+        Edges of the designed component.
+    beams : ndarray, shape (9, k)
+        As the kernels take them (:func:`bimfit.estimation.ownership.packed`).
+    origin : ndarray, shape (2, k)
+        Where each starts from.
+    margin, bearing : float
+        How far behind a surface a return went past it, m, and the blur of a bearing, rad.
+    """
+
+    rows: Array
+    beams: Array
+    origin: Array
+    margin: float
+    bearing: float
+
+
+@dataclass(frozen=True)
 class Posterior:
     """What one slice says about one component.
 
@@ -68,6 +91,8 @@ class Posterior:
         Root mean square distance of the returns from the pivot, m.
     ess : float
         Effective number of nodes or samples behind the moments.
+    heard : Heard or None
+        The beams behind it.
     """
 
     pose: Pose2D
@@ -82,6 +107,7 @@ class Posterior:
     rival_offset: float
     radius: float
     ess: float = float("nan")
+    heard: Heard | None = field(default=None, repr=False)
 
 
 @lru_cache(maxsize=1)
@@ -131,10 +157,11 @@ def component_posterior(
     """
     other = _NOWHERE if begin is None else begin.as_array()
     out = np.empty(36)
+    speak = np.ones(len(beams), bool) if use is None else use
+    every, bearing = packed(beams, cost, model), _BEARING * beams.spacing
     found = _kernels.component(
-        rows, start.as_array(), other, np.ones(len(beams), bool) if use is None else use,
-        packed(beams, cost, model), beams.start, beams.eye, cost.margin, _NEAR, _MIN_HITS,
-        _BEARING * beams.spacing, np.array([window.shift, window.shift, window.angle]), window.reach,
+        rows, start.as_array(), other, speak, every, beams.start, beams.eye, cost.margin, _NEAR, _MIN_HITS,
+        bearing, np.array([window.shift, window.shift, window.angle]), window.reach,
         window.least, _CELLS, _draws(), out,
     )  # fmt: skip
     if not found:
@@ -154,4 +181,5 @@ def component_posterior(
         rival_offset=offset,
         radius=radius,
         ess=ess,
+        heard=Heard(rows, every[:, : len(beams)][:, speak], beams.origins[:, speak], cost.margin, bearing),
     )

@@ -6,6 +6,7 @@ x = (u, v, theta). Stations enter by what their ranges say alone: precision L_i 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -24,6 +25,7 @@ _LEAST = 0.75
 """Cells shared by stations never make a variance less than this share of what it is without."""
 _HARMONICS = 8
 _SOME = 0.05
+_OWN, _STRAIGHT = 0.003, 2e-6
 _JUMPS = 0.01
 """Share of stations that jump."""
 
@@ -124,6 +126,32 @@ def polynomial(s: Array, *, turning: bool, moving: bool = True) -> Basis:
     t = (s - s.mean()) / max(float(np.ptp(s)), 1e-9)
     moves = np.array([[True, True, True], [moving, moving, turning]])
     return Basis(np.stack([np.ones_like(t), t], axis=1), moves)
+
+
+def bowed(basis: Basis, rough: Trend, pair: tuple[Trend, Trend]) -> tuple[Basis, Trend]:
+    """A linear motion that may bow a little: what moves within a joint that turns moves along a curve.
+
+    A shift d(t) of a component within a joint that has turned by phi(t) is seen as R(phi(t)) d(t): with both
+    linear in t from -1/2 to 1/2, over which they change by D and Phi, that bows by 4 t^2 (Phi perp(D) / 4).
+    What of their turning and their drift the joint has and what they have of their own is not known: Phi is
+    of the size of their changes of angle, and D of half of what they drift apart by, and 3 mm besides.
+    """
+    t = basis.functions[:, 1]
+    a, b = (p.value[-1] - p.value[0] for p in pair)
+    turn = math.sqrt(0.5 * float(a[2] ** 2 + b[2] ** 2))
+    sd = 0.25 * turn * math.hypot(0.5 * float(np.hypot(*(b - a)[:2])), _OWN)
+    if sd < _STRAIGHT or not basis.moves[1, 2]:
+        return basis, rough
+    functions = np.column_stack([basis.functions, 4.0 * t * t - 1.0 / 3.0])
+    penalty = np.zeros((3, 3, 3))
+    penalty[2, 2, :2] = sd**-2
+    free = len(rough.spread)
+    spread = np.zeros((free + 2, free + 2))
+    spread[:free, :free] = rough.spread
+    spread[free:, free:] = np.eye(2) * sd**2
+    return Basis(functions, np.vstack([basis.moves, [[True, True, False]]]), penalty), replace(
+        rough, spread=spread
+    )
 
 
 def nodes(s: Array) -> Array:
