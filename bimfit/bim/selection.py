@@ -105,6 +105,7 @@ def choose_joints(
         found = find_joints(model, rules)
     if not found:
         remedy = "name the pair with --joint GUID,GUID or widen --width"
+        remedy = "; ".join([*(note for note in model.notes if "cut off" in note), remedy])
         raise JointError(f"no joint found: {no_joint_reason(model, rules)}", file=model.path, remedy=remedy)
     kept = tuple(
         joint

@@ -66,7 +66,7 @@ def read_source(path: str | Path) -> Source:
     try:
         raw = file.read_bytes()
     except IsADirectoryError as error:
-        raise ModelError("is a folder, not an IFC file", file=file) from error
+        raise ModelError("is a folder, not an IFC file", file=file, remedy="name the .ifc in it") from error
     except OSError as error:
         raise ModelError(f"cannot be read: {error.strerror}", file=file) from error
     if not raw.strip():
@@ -89,7 +89,9 @@ def read_source(path: str | Path) -> Source:
     nearest = nearest_schema(schema)
     if nearest is None:
         raise ModelError(
-            f"is of schema {_printable(schema) or 'unknown'}, which is not IFC2X3, IFC4 or IFC4X3", file=file
+            f"is of schema {_printable(schema) or 'unknown'}, which is not IFC2X3, IFC4 or IFC4X3",
+            file=file,
+            remedy="export it again as IFC4",
         )
     if named.group(1) != nearest.encode():
         data = data[: named.start(1)] + nearest.encode() + data[named.end(1) :]
@@ -127,7 +129,11 @@ def _check_kind(data: bytes, file: Path) -> None:
         raise ModelError("is XML; ifcXML is not read", file=file, remedy="export it as .ifc (STEP)")
     if head[:1] == b"{":
         raise ModelError("is JSON; ifcJSON is not read", file=file, remedy="export it as .ifc (STEP)")
-    raise ModelError("is not an IFC file (no ISO-10303-21 header)", file=file)
+    raise ModelError(
+        "is not an IFC file (no ISO-10303-21 header)",
+        file=file,
+        remedy="name a model as .ifc or .ifczip, and before the scan",
+    )
 
 
 def _unzip(data: bytes, file: Path) -> bytes:
@@ -137,7 +143,11 @@ def _unzip(data: bytes, file: Path) -> bytes:
                 e for e in archive.infolist() if e.filename.lower().endswith(".ifc") and not e.is_dir()
             ]
             if len(entries) != 1:
-                raise ModelError(f"is an archive with {len(entries)} .ifc files in it, not one", file=file)
+                raise ModelError(
+                    f"is an archive with {len(entries)} .ifc files in it, not one",
+                    file=file,
+                    remedy="unpack it and name one of them",
+                )
             entry = entries[0]
             limit = min(_LARGEST, max(1 << 20, _LARGEST_RATIO * max(entry.compress_size, 1)))
             with archive.open(entry) as stream:
@@ -147,5 +157,7 @@ def _unzip(data: bytes, file: Path) -> bytes:
     except Exception as error:  # zlib, lzma and zipfile raise errors of many kinds
         raise ModelError(f"is a damaged archive: {_printable(str(error))}", file=file) from error
     if len(content) > limit:
-        raise ModelError("unpacks to far more than an IFC file would; refused", file=file)
+        raise ModelError(
+            "unpacks to far more than an IFC file would", file=file, remedy="unpack it and name the .ifc"
+        )
     return content

@@ -13,7 +13,7 @@ from bimfit.pipeline.as_built import try_write_model
 from bimfit.pipeline.document import ResultsDocument, read_results
 from bimfit.pipeline.issues import open_building, write_issues
 from bimfit.pipeline.limits import Limits, judge
-from bimfit.pipeline.output import DERIVED, write_survey
+from bimfit.pipeline.output import DERIVED, whole_folder, write_results
 from bimfit.pipeline.pictures import write_pictures
 from bimfit.pipeline.records import SurveyResult
 from bimfit.pipeline.report import write_report
@@ -97,25 +97,9 @@ def deliver(
     BimfitError
         When the folder or the file of issues cannot be written.
     """
-    notes: list[str] = []
-    progress("writing", 0.0)
-    files = [*write_survey(survey, folder, limits=wanted.limits.given)]
-    results = read_results(folder)
-    tables, note = write_schedule(results, folder, wanted.limits)
-    files += tables
-    notes += [note] if note else []
-    if wanted.as_built:
-        progress("writing the as-built model", 0.0)
-        written, notes_of_model = try_write_model(survey, folder, move_elements=wanted.move_elements)
-        files += [written] if written else []
-        notes += notes_of_model
-    if wanted.pictures:
-        progress("drawing", 0.0)
-        files += write_pictures(survey, folder, truths)
-    if wanted.report:
-        files.append(
-            write_report(results, folder, wanted.limits, building=survey.building, progress=progress)
-        )
+    with whole_folder(folder, (survey.model, survey.scan)) as stage:
+        results, files, notes = _write(survey, stage, wanted, progress, truths)
+    files = [folder / file.name for file in files]
     if wanted.limits.given:
         notes.append(_told(results, wanted.limits))
     if wanted.bcf is not None:
@@ -131,6 +115,35 @@ def deliver(
         files.append(wanted.bcf)
         notes.append(f"{len(issues)} issue{'s' if len(issues) != 1 else ''} in {wanted.bcf}")
     return tuple(files), tuple(notes)
+
+
+def _write(
+    survey: SurveyResult,
+    folder: Path,
+    wanted: Deliverables,
+    progress: Progress,
+    truths: Mapping[str, JointTruth] | None,
+) -> tuple[ResultsDocument, list[Path], list[str]]:
+    """Write the folder's files: results as read back, files, notes."""
+    progress("writing", 0.0)
+    files = [*write_results(survey, folder, limits=wanted.limits.given)]
+    results = read_results(folder)
+    tables, note = write_schedule(results, folder, wanted.limits)
+    files += tables
+    notes = [note] if note else []
+    if wanted.as_built:
+        progress("writing the as-built model", 0.0)
+        written, notes_of_model = try_write_model(survey, folder, move_elements=wanted.move_elements)
+        files += [written] if written else []
+        notes += notes_of_model
+    if wanted.pictures:
+        progress("drawing", 0.0)
+        files += write_pictures(survey, folder, truths)
+    if wanted.report:
+        files.append(
+            write_report(results, folder, wanted.limits, building=survey.building, progress=progress)
+        )
+    return results, files, notes
 
 
 def _told(results: ResultsDocument, limits: Limits) -> str:

@@ -1,16 +1,19 @@
-"""The output folder: every file appears whole, no input is overwritten, nothing stale is left."""
+"""The output folder: a run's files appear together, no input is overwritten, nothing stale is left."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import shutil
 import statistics
+import tempfile
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bimfit.errors import ExportError
+from bimfit.errors import BimfitError, ExportError
 from bimfit.files import protect_inputs, write_text
 from bimfit.pipeline.document import closest
 from bimfit.pipeline.records import JointResult, SurveyResult
@@ -32,7 +35,7 @@ def write_survey(
     formats: Sequence[str] = MESH_FORMATS,
     limits: Mapping[str, tuple[float, float]] | None = None,
 ) -> tuple[Path, ...]:
-    """Write meshes, stations.csv and, last, results.json.
+    """Write meshes, stations.csv and results.json, all or nothing.
 
     Parameters
     ----------
@@ -54,18 +57,77 @@ def write_survey(
     ExportError
         When the folder cannot be written, or a file in it is an input of the run.
     """
-    prepare_folder(folder)
+    with whole_folder(folder, (survey.model, survey.scan)) as stage:
+        files = write_results(survey, stage, formats=formats, limits=limits)
+    return tuple(folder / file.name for file in files)
+
+
+def write_results(
+    survey: SurveyResult,
+    stage: Path,
+    *,
+    formats: Sequence[str] = MESH_FORMATS,
+    limits: Mapping[str, tuple[float, float]] | None = None,
+) -> tuple[Path, ...]:
+    """:func:`write_survey` into a folder that is there and not yet anybody's."""
     meshes = {j.joint.id: j.mesh for j in survey.joints if j.mesh is not None}
-    planned = [folder / f"gap-{safe_name(i)}.{f}" for i in meshes for f in formats]
-    planned += [folder / "results.json", folder / "stations.csv"]
-    protect_inputs([*planned, *(folder / name for name in DERIVED)], (survey.model, survey.scan))
-    stale = _earlier_files(folder) - set(planned) - {survey.model.absolute(), survey.scan.absolute()}
-    files = {i: _write_meshes(i, mesh, folder, formats) for i, mesh in meshes.items()}
-    write_text(folder / "stations.csv", stations_to_csv(survey.joints))
-    write_text(folder / "results.json", to_json(survey_to_dict(survey, files, limits)))
-    for path in stale:
-        path.unlink(missing_ok=True)
-    return tuple(planned)
+    planned = [stage / f"gap-{safe_name(i)}.{f}" for i in meshes for f in formats]
+    files = {i: _write_meshes(i, mesh, stage, formats) for i, mesh in meshes.items()}
+    write_text(stage / "stations.csv", stations_to_csv(survey.joints))
+    write_text(stage / "results.json", to_json(survey_to_dict(survey, files, limits)))
+    return (*planned, stage / "results.json", stage / "stations.csv")
+
+
+@contextlib.contextmanager
+def whole_folder(folder: Path, inputs: Sequence[Path]) -> Iterator[Path]:
+    """Give a temporary folder whose files move into ``folder`` when the block ends well, and else are gone.
+
+    Files of an earlier run that are not written again are then removed. A ``folder`` that had to be made is
+    removed again when the block fails.
+
+    Raises
+    ------
+    ExportError
+        When the folder cannot be written, or a file would take the place of an input.
+    """
+    made = not folder.exists()
+    prepare_folder(folder)
+    stage = None
+    try:
+        try:
+            stage = Path(tempfile.mkdtemp(prefix=".writing-", dir=folder))
+        except OSError as error:
+            raise ExportError(
+                f"cannot be written to: {error.strerror}", file=folder, remedy="choose another -o"
+            ) from error
+        try:
+            yield stage
+        except BimfitError as error:
+            if Path(error.file).parent == stage:  # in a message, by the name that it was going to have
+                error.file = str(folder / Path(error.file).name)
+            raise
+        files = sorted(stage.iterdir(), key=lambda file: file.name == "results.json")
+        targets = [folder / file.name for file in files]
+        protect_inputs(targets, inputs)
+        stale = _earlier_files(folder) - set(targets) - {path.absolute() for path in inputs}
+        for file, target in zip(files, targets, strict=True):
+            _take_place(file, target)
+        for path in stale:
+            path.unlink(missing_ok=True)
+        made = False
+    finally:
+        if stage is not None:
+            shutil.rmtree(stage, ignore_errors=True)
+        if made:
+            with contextlib.suppress(OSError):  # somebody else may have put something there
+                folder.rmdir()
+
+
+def _take_place(file: Path, target: Path) -> None:
+    try:
+        file.replace(target)
+    except OSError as error:
+        raise ExportError(f"cannot be written: {error.strerror}", file=target) from error
 
 
 def prepare_folder(folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -215,6 +216,31 @@ def test_a_second_run_replaces_the_first(model, scan, results, tmp_path):
     assert (folder / "mine.txt").read_text() == "kept"
 
 
+def test_a_run_that_is_broken_off_while_writing_changes_nothing(model, scan, results, tmp_path, monkeypatch):
+    def broken(*_args, **_kw):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("bimfit.pipeline.deliver.write_schedule", broken)
+    words = ["fit", str(model), str(scan), "--no-pictures", "--no-report", "-o"]
+    assert main([*words, str(tmp_path / "fresh")]) == 130
+    assert not (tmp_path / "fresh").exists()
+    folder = tmp_path / "again"
+    shutil.copytree(results, folder)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert main([*words, str(folder)]) == 130
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_a_full_disk_is_told_by_the_name_that_the_file_would_have(model, scan, tmp_path, capsys, monkeypatch):
+    def full(*_args, **_kw):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("bimfit.files.Path.replace", full)
+    line = refused(["fit", model, scan, "--no-pictures", "--no-report", "-o", tmp_path / "o"], capsys)
+    assert says(line, tmp_path / "o" / "gap-", "No space left")
+    assert not (tmp_path / "o").exists()
+
+
 def test_joints_lists_what_results_name(model, results, capsys):
     assert main(["joints", str(model), "--json"]) == 0
     listed = json.loads(capsys.readouterr().out)
@@ -274,23 +300,26 @@ def test_a_joint_that_cannot_be_estimated_is_exit_1(model, scan, tmp_path, capsy
         assert station["reason"]
 
 
-def refuse(words, capsys, *named):
-    """Exit 2 with one line on stderr that names what is wrong."""
+def refused(words, capsys) -> str:
+    """The one line on stderr of a command that ends with exit status 2."""
     assert main([str(word) for word in words]) == 2
     captured = capsys.readouterr()
     lines = captured.err.strip().splitlines()
     assert len(lines) == 1, captured.err
     assert "Traceback" not in captured.err
     assert "internal error" not in captured.err
-    for name in named:
-        assert str(name) in lines[0], lines[0]
+    return lines[0]
+
+
+def says(line, *named) -> bool:
+    return all(str(name) in line for name in named)
 
 
 def test_not_an_ifc(scan, tmp_path, capsys):
     wrong = tmp_path / "wrong.ifc"
     wrong.write_text("this is not a model\n")
-    refuse(["fit", wrong, scan, "-o", tmp_path / "o"], capsys, "wrong.ifc")
-    refuse(["joints", tmp_path / "missing.ifc"], capsys, "missing.ifc")
+    assert says(refused(["fit", wrong, scan, "-o", tmp_path / "o"], capsys), "wrong.ifc", "before the scan")
+    assert says(refused(["joints", tmp_path / "missing.ifc"], capsys), "missing.ifc")
     assert not (tmp_path / "o").exists()
 
 
@@ -300,7 +329,7 @@ def test_ifc_without_geometry(scan, tmp_path, capsys):
     bare = ifcopenshell.file(schema="IFC4")
     bare.create_entity("IfcProject", GlobalId=ifcopenshell.guid.new())
     bare.write(str(tmp_path / "bare.ifc"))
-    refuse(["fit", tmp_path / "bare.ifc", scan, "-o", tmp_path / "o"], capsys, "bare.ifc")
+    assert says(refused(["fit", tmp_path / "bare.ifc", scan, "-o", tmp_path / "o"], capsys), "bare.ifc")
 
 
 def test_no_joint_found(model, scan, tmp_path, capsys):
@@ -313,21 +342,30 @@ def test_no_joint_found(model, scan, tmp_path, capsys):
     x, y, z = point.Coordinates
     point.Coordinates = (x + 50.0, y + 50.0, z)
     file.write(str(tmp_path / "apart.ifc"))
-    refuse(["joints", tmp_path / "apart.ifc"], capsys, "apart.ifc", "no joint")
-    refuse(["fit", tmp_path / "apart.ifc", scan, "-o", tmp_path / "o"], capsys, "no joint")
+    assert says(refused(["joints", tmp_path / "apart.ifc"], capsys), "apart.ifc", "no joint")
+    assert says(refused(["fit", tmp_path / "apart.ifc", scan, "-o", tmp_path / "o"], capsys), "no joint")
+
+
+def test_a_model_that_is_cut_off_is_named_as_such(model, tmp_path, capsys):
+    text = model.read_text()
+    cut = tmp_path / "cut.ifc"
+    cut.write_text(text[: text.rindex("=IFCPLATE(")])
+    assert says(refused(["joints", cut], capsys), "cut.ifc", "no joint", "cut off")
 
 
 def test_scan_far_from_the_model(model, scan, tmp_path, capsys):
     pose = "1000,0,0,0,0,0"
-    refuse(["fit", model, scan, "--scan-pose", pose, "-o", tmp_path / "o"], capsys, "scan.csv", "far")
+    assert says(
+        refused(["fit", model, scan, "--scan-pose", pose, "-o", tmp_path / "o"], capsys), "scan.csv", "far"
+    )
 
 
 def test_empty_scan(model, tmp_path, capsys):
     empty = tmp_path / "empty.csv"
     empty.write_text("")
-    refuse(["fit", model, empty, "-o", tmp_path / "o"], capsys, "empty.csv")
+    assert says(refused(["fit", model, empty, "-o", tmp_path / "o"], capsys), "empty.csv")
     empty.write_text("scan,ox,oy,oz,dx,dy,dz,range\n")
-    refuse(["fit", model, empty, "-o", tmp_path / "o"], capsys, "empty.csv")
+    assert says(refused(["fit", model, empty, "-o", tmp_path / "o"], capsys), "empty.csv")
 
 
 @pytest.mark.parametrize(
@@ -343,39 +381,47 @@ def test_empty_scan(model, tmp_path, capsys):
 def test_damaged_line_scans(model, scan, tmp_path, capsys, change, named):
     damaged = tmp_path / "damaged.csv"
     damaged.write_text("\n".join(change(scan.read_text().splitlines())) + "\n")
-    refuse(["fit", model, damaged, "-o", tmp_path / "o"], capsys, "damaged.csv", *named)
+    assert says(refused(["fit", model, damaged, "-o", tmp_path / "o"], capsys), "damaged.csv", *named)
 
 
 def test_unknown_names(model, scan, tmp_path, capsys):
     out = ["-o", tmp_path / "o"]
-    refuse(["fit", model, scan, "--joint", "nosuch", *out], capsys, "nosuch")
-    refuse(["fit", model, scan, "--joint", "A,B", *out], capsys)
-    refuse(["fit", model, scan, "--method", "magic", *out], capsys, "magic", "grcsm")
-    refuse(["fit", model, scan, "--motion", "dance", *out], capsys, "dance", "kinked")
-    refuse(["compare", model, scan, "--methods", "grcsm,magic", *out], capsys, "magic")
-    refuse(["fit", model, scan, "--window", "1,2", *out], capsys, "--window")
-    refuse(["fit", model, scan, "--tolerance", "1parsec,1mm,1deg", *out], capsys, "--tolerance")
-    refuse(["fit", model, scan, "--spacing", "-1mm", *out], capsys)
-    refuse(["fit", model, scan], capsys, "output")
-    refuse(["fit", model, scan, "--limits", "width=3", *out], capsys, "--limits", "12..30mm")
-    refuse(["fit", model, scan, "--bcf", tmp_path / "i.bcf", "--bcf-version", "4", *out], capsys, "3.0")
-    refuse(["fit", model, scan, "--bcf", model, *out], capsys, ".bcf")
-    refuse(["nosuchcommand"], capsys, "nosuchcommand")
-    refuse(["view", tmp_path], capsys, "results.json")
+    assert says(refused(["fit", model, scan, "--joint", "nosuch", *out], capsys), "nosuch")
+    assert refused(["fit", model, scan, "--joint", "A,B", *out], capsys)
+    assert says(refused(["fit", model, scan, "--method", "magic", *out], capsys), "magic", "grcsm")
+    assert says(refused(["fit", model, scan, "--motion", "dance", *out], capsys), "dance", "kinked")
+    assert says(refused(["compare", model, scan, "--methods", "grcsm,magic", *out], capsys), "magic")
+    assert says(refused(["fit", model, scan, "--window", "1,2", *out], capsys), "--window")
+    assert says(refused(["fit", model, scan, "--tolerance", "1parsec,1mm,1deg", *out], capsys), "--tolerance")
+    assert refused(["fit", model, scan, "--spacing", "-1mm", *out], capsys)
+    assert says(refused(["fit", model, scan], capsys), "output")
+    assert says(refused(["fit", model, scan, "--limits", "width=3", *out], capsys), "--limits", "12..30mm")
+    assert says(
+        refused(["fit", model, scan, "--bcf", tmp_path / "i.bcf", "--bcf-version", "4", *out], capsys), "3.0"
+    )
+    assert says(refused(["fit", model, scan, "--bcf", model, *out], capsys), ".bcf")
+    assert says(refused(["nosuchcommand"], capsys), "nosuchcommand")
+    assert says(refused(["view", tmp_path], capsys), "results.json")
     settings = tmp_path / "settings.toml"
     settings.write_text("[search]\nwindwo = 3\n")
-    refuse(["fit", model, scan, "--config", settings, *out], capsys, "settings.toml", "windwo", "window")
+    assert says(
+        refused(["fit", model, scan, "--config", settings, *out], capsys), "settings.toml", "windwo", "window"
+    )
 
 
 def test_inputs_are_never_overwritten(model, scan, tmp_path, capsys):
     mine = tmp_path / "results.json"
     shutil.copy(scan, tmp_path / "scan.csv")
     shutil.copy(model, mine)  # a model by the name of an output
-    refuse(["fit", mine, tmp_path / "scan.csv", "-o", tmp_path], capsys, "results.json", "never overwritten")
+    assert says(
+        refused(["fit", mine, tmp_path / "scan.csv", "-o", tmp_path], capsys),
+        "results.json",
+        "never overwritten",
+    )
     assert mine.read_bytes() == model.read_bytes()
     copy = tmp_path / "model.ifc"
     shutil.copy(model, copy)
-    refuse(["simulate", copy, "-o", copy], capsys, "never overwritten")
+    assert says(refused(["simulate", copy, "-o", copy], capsys), "never overwritten")
     assert copy.read_bytes() == model.read_bytes()
 
 
@@ -429,7 +475,7 @@ def test_a_scan_of_a_piece_of_a_joint_says_how_to_fit_it(model, scan, tmp_path, 
     first = [row for row in rows[1:] if float(row.split(",")[2]) < 0.12]
     (tmp_path / "piece.csv").write_text("\n".join([rows[0], *first]) + "\n")
     words = ["fit", model, tmp_path / "piece.csv", "-o", tmp_path / "o"]
-    refuse(words, capsys, "piece.csv", "as a whole", "--joint")
+    assert says(refused(words, capsys), "piece.csv", "as a whole", "--joint")
     assert main([str(word) for word in [*words, "--joint", "hxkft", "--no-pictures", "--no-report"]]) == 0
 
 
