@@ -26,6 +26,7 @@ from bimfit._kernels import jit, jit_inner, jit_inner_sums, jit_sums
 from bimfit.geometry.pose import Array
 
 Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 RANGE, OFF, DEEP, LIMIT, INVERSE, TOP = 3, 4, 5, 6, 7, 8
 STEEP = 0.3
@@ -121,20 +122,46 @@ def predict(
 
 
 @jit
+def whole_beams(o: Array, d: Array, near: float) -> tuple[Ints, bool]:
+    """Beams whose origin and direction are numbers, and whether their origins all but coincide."""
+    whole = np.empty(o.shape[0], np.int64)
+    count, one = 0, True
+    for k in range(o.shape[0]):
+        if np.isfinite(o[k, 0]) and np.isfinite(o[k, 1]) and np.isfinite(d[k, 0]) and np.isfinite(d[k, 1]):
+            whole[count] = k
+            count += 1
+            away = max(abs(o[k, 0] - o[whole[0], 0]), abs(o[k, 1] - o[whole[0], 1]))
+            one = one and not away > near
+    return whole[:count], one
+
+
+@jit
 def sort_beams(
-    o: Array, d: Array, group: Ints, count: int, eye: Array, p: Array, order: Ints, start: Ints
-) -> None:
-    """Order beams by group and pseudo-angle about their group's mean direction."""
-    n = group.shape[0]
-    eye[:] = 0.0
-    for k in range(n):
-        g = group[k]
+    o: Array, d: Array, r: Array, whole: Ints, group: Ints, count: int, missing: float
+) -> tuple[Array, Array, Ints, Array, Ints]:
+    """Order beams by group and pseudo-angle about their group's mean direction.
+
+    Parameters
+    ----------
+    whole, group : (n,)
+        Which beams there are, and the group of each.
+    missing : float
+        Range that stands for one that is not finite.
+
+    Returns
+    -------
+    rays, ranges, start, eye, order
+        As in :class:`~bimfit.estimation.likelihood.BeamSet`.
+    """
+    n = whole.shape[0]
+    eye, start, key = np.zeros((count, 4)), np.zeros(count + 1, np.int64), np.empty(n)
+    for i in range(n):
+        g, k = group[i], whole[i]
         start[g + 1] += 1
         eye[g, 0] += o[k, 0]
         eye[g, 1] += o[k, 1]
         eye[g, 2] += d[k, 0]
         eye[g, 3] += d[k, 1]
-    key = np.empty(n)
     for g in range(count):
         eye[g, 0] /= start[g + 1]
         eye[g, 1] /= start[g + 1]
@@ -145,13 +172,17 @@ def sort_beams(
         else:
             eye[g, 2], eye[g, 3] = 1.0, 0.0
         start[g + 1] += start[g]
-    for k in range(n):
-        lx, ly = eye[group[k], 2], eye[group[k], 3]
-        key[k] = pseudo_angle(lx * d[k, 0] + ly * d[k, 1], lx * d[k, 1] - ly * d[k, 0])
-    rank = np.argsort(key + 8.0 * group)
     for i in range(n):
-        order[i] = rank[i]
-        p[i] = key[rank[i]]
+        k, lx, ly = whole[i], eye[group[i], 2], eye[group[i], 3]
+        key[i] = pseudo_angle(lx * d[k, 0] + ly * d[k, 1], lx * d[k, 1] - ly * d[k, 0])
+    rank = np.argsort(key + 8.0 * group)
+    rays, ranges, order = np.empty((3, n)), np.empty(n), np.empty(n, np.int64)
+    for i in range(n):
+        k = whole[rank[i]]
+        order[i] = k
+        rays[0, i], rays[1, i], rays[2, i] = key[rank[i]], d[k, 0], d[k, 1]
+        ranges[i] = r[k] if np.isfinite(r[k]) else missing
+    return rays, ranges, start, eye, order
 
 
 @jit
@@ -184,34 +215,113 @@ def beam_spacing(d: Array) -> float:
 
 
 @jit
-def cover_cost(r: Array, miss: float, past: float, same: float, off: Array, deep: Array) -> None:
-    """What covering each beam costs: ``miss`` where it returned nothing, ``past`` where it went past.
+def table(
+    rays: Array, r: Array, scale: Array, inverse: float, top: float, miss: float, past: float, same: float
+) -> Array:
+    """Beams as the likelihood takes them when nothing is known of the other component.
 
-    Only a return that a neighbour bears out, within ``same``, may have come from behind.
+    Covering a beam costs ``miss`` where it returned nothing, ``past`` where it went past: only a return that
+    a neighbour bears out, within ``same``, may have come from behind.
+
+    Parameters
+    ----------
+    scale : (n,) or (0,)
+        How many times the sigma of ``inverse`` and ``top`` each beam has.
     """
     n = r.shape[0]
+    B = np.zeros((TOP + 1, n + PAD))
     for k in range(n):
-        off[k] = miss if r[k] < 0.0 else 0.0
-        deep[k] = 0.0
+        B[0, k], B[1, k], B[2, k], B[RANGE, k] = rays[0, k], rays[1, k], rays[2, k], r[k]
+        B[OFF, k] = miss if r[k] < 0.0 else 0.0
         if r[k] > 0.0:
             before = k > 0 and r[k - 1] > 0.0 and abs(r[k] - r[k - 1]) < same
             after = k + 1 < n and r[k + 1] > 0.0 and abs(r[k + 1] - r[k]) < same
             if before or after:
-                deep[k] = past
+                B[DEEP, k] = past
+        B[LIMIT, k] = np.inf
+        B[INVERSE, k], B[TOP, k] = inverse, top
+        if scale.shape[0] > 0:
+            B[INVERSE, k] /= scale[k]
+            B[TOP, k] -= math.log(scale[k])
+    return B
+
+
+@jit
+def taken(B: Array, start: Ints, use: Mask) -> tuple[Array, Ints]:
+    """The beams in ``use``, padded again; groups left empty stay."""
+    n = 0
+    for k in range(use.shape[0]):
+        n += int(use[k])
+    out, begin = np.zeros((B.shape[0], n + PAD)), np.empty(start.shape[0], np.int64)
+    i = 0
+    for g in range(start.shape[0] - 1):
+        begin[g] = i
+        for k in range(start[g], start[g + 1]):
+            if use[k]:
+                for j in range(B.shape[0]):
+                    out[j, i] = B[j, k]
+                i += 1
+    begin[start.shape[0] - 1] = i
+    return out, begin
 
 
 @jit
 def scene(
-    edges_a: Array, edges_b: Array, pose_a: Array, pose_b: Array, rays: Array, start: Ints, eye: Array,
-    rho: Array, face: Ints,
-) -> None:  # fmt: skip
-    """Ranges (2, n) to A and to B at a pose each, and the edges met."""
-    rho[:] = np.inf
-    face[:] = -1
+    edges_a: Array, edges_b: Array, pose_a: Array, pose_b: Array, rays: Array, start: Ints, eye: Array
+) -> tuple[Array, Ints]:
+    """Ranges (2, n) to A and to B at a pose each, inf where a beam does not meet it, and the edges met."""
+    n = start[start.shape[0] - 1]
+    rho, face = np.full((2, n), np.inf), np.full((2, n), -1, np.int64)
     cos, sin = math.cos(pose_a[2]), math.sin(pose_a[2])
     predict(edges_a, cos, sin, pose_a[0], pose_a[1], rays, start, eye, rho[0], face[0])
     cos, sin = math.cos(pose_b[2]), math.sin(pose_b[2])
     predict(edges_b, cos, sin, pose_b[0], pose_b[1], rays, start, eye, rho[1], face[1])
+    return rho, face
+
+
+@jit
+def look(
+    edges_a: Array, edges_b: Array, pose: Array, B: Array, start: Ints, eye: Array, steep: float, far: float
+) -> tuple[Array, Ints, Ints, Mask]:
+    """What the beams should see with both components at one pose, and which may speak for which.
+
+    Parameters
+    ----------
+    steep, far : float
+        A beam that meets a face at |n.d| less than the one, further than the other from the mouth's middle,
+        m, may not speak.
+
+    Returns
+    -------
+    rho, face : (2, n)
+        As from :func:`scene`.
+    side : (n,)
+        See :func:`~bimfit.estimation.ownership.split_side`.
+    use : (3, n)
+        Beams that may speak at all, and those for A and for B while the other is known from here alone.
+    """
+    rho, face = scene(edges_a, edges_b, pose, pose, B, start, eye)
+    n = rho.shape[1]
+    side, use = np.empty(n, np.int64), np.ones((3, n), np.bool_)
+    _split_side(rho, B, start, eye, pose[0], pose[1], side)
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    for which in range(2):
+        edges = edges_a if which == 0 else edges_b
+        for g in range(eye.shape[0]):
+            for k in range(start[g], start[g + 1]):
+                e, r = face[which, k], rho[which, k]
+                hidden = rho[1 - which, k] < r
+                use[1 + which, k] = side[k] == which and not (e >= 0 and hidden)
+                if e < 0:
+                    continue
+                nx = cos * edges[e, 4] - sin * edges[e, 5]
+                ny = sin * edges[e, 4] + cos * edges[e, 5]
+                x, y = eye[g, 0] + B[1, k] * r - pose[0], eye[g, 1] + B[2, k] * r - pose[1]
+                if abs(nx * B[1, k] + ny * B[2, k]) < steep and math.hypot(x, y) > far:
+                    use[0, k] = False
+    for k in range(n):
+        use[1, k], use[2, k] = use[1, k] and use[0, k], use[2, k] and use[0, k]
+    return rho, face, side, use
 
 
 @jit
@@ -223,8 +333,13 @@ def _owner(a: float, b: float) -> int:
 
 
 @jit
-def split_side(rho: Array, p: Array, start: Ints, eye: Array, cx: float, cy: float, side: Ints) -> None:
-    """Give every beam to the component on whose side of the cut it passes; see ownership.split_side."""
+def _split_side(rho: Array, B: Array, start: Ints, eye: Array, cx: float, cy: float, side: Ints) -> None:
+    """Give every beam to the component on whose side of the gap's centre (cx, cy) it passes.
+
+    Where that leaves many beams on the wrong side, the cut that separates the components best is taken. 0 is
+    A's, 1 is B's, -1 where a group of beams meets neither.
+    """
+    p = B[0]
     for g in range(eye.shape[0]):
         s, t = start[g], start[g + 1]
         ox, oy, lx, ly = eye[g, 0], eye[g, 1], eye[g, 2], eye[g, 3]
@@ -275,10 +390,63 @@ def _better_cut(
 
 
 @jit
-def through(
-    corners: Array, rays: Array, r: Array, start: Ints, eye: Array, nearest: Array, depth: float, sigma: float
+def weigh(
+    edges_a: Array, edges_b: Array, poses: Array, mouth: Array, B: Array, start: Ints, eye: Array,
+    usable: Mask, depth: float, sigma: float, few: int,
+) -> tuple[Array, Ints, int, bool]:  # fmt: skip
+    """What the beams should see with a pose (2, 3) each, how many went in between, and whether it is close.
+
+    Parameters
+    ----------
+    mouth : (2, 2)
+        Mouth corners of A and B as designed.
+    usable : (n,)
+        Beams that may speak.
+    depth : float
+        A return that much farther than the corners went past them, m.
+    sigma : float
+        Standard deviation of a range, m.
+    few : int
+        Fewer open beams than that between A and B leave them close together.
+
+    Returns
+    -------
+    rho, face : (2, n)
+        As from :func:`scene`.
+    passed : int
+        Beams that went in between the mouth corners.
+    close : bool
+        Whether one hides part of the other, or hardly a beam passes between them, at the mouth or elsewhere
+        as in a groove closed at its root.
+    """
+    rho, face = scene(edges_a, edges_b, poses[0], poses[1], B, start, eye)
+    corners = np.empty((2, 2))
+    for i in range(2):
+        cos, sin = math.cos(poses[i, 2]), math.sin(poses[i, 2])
+        corners[i, 0] = cos * mouth[i, 0] - sin * mouth[i, 1] + poses[i, 0]
+        corners[i, 1] = sin * mouth[i, 0] + cos * mouth[i, 1] + poses[i, 1]
+    passed = _through(corners, B, start, eye, rho, depth, sigma)
+    close = passed < few
+    last, at = -1, 0
+    for k in range(rho.shape[1]):
+        own = _owner(rho[0, k], rho[1, k])
+        if own < 0:
+            continue
+        close = close or (face[0, k] >= 0 and face[1, k] >= 0 and usable[k])
+        close = close or (last >= 0 and own != last and k - at - 1 < few)
+        last, at = own, k
+    return rho, face, passed, close
+
+
+@jit
+def _through(
+    corners: Array, B: Array, start: Ints, eye: Array, rho: Array, depth: float, sigma: float
 ) -> int:
-    """How many beams went in between the mouth corners (2, 2); see ownership.through."""
+    """How many beams went in between two corners (2, 2): missing, or back from deeper than the mouth.
+
+    A return from a groove's own face went in as well. 0 too where fewer than half of the beams between the
+    corners did so: then something is there.
+    """
     passed = between = 0
     for g in range(eye.shape[0]):
         s, t = start[g], start[g + 1]
@@ -290,12 +458,57 @@ def through(
             x, y = corners[c, 0] - ox, corners[c, 1] - oy
             bearing = pseudo_angle(lx * x + ly * y, lx * y - ly * x)
             low, high, level = min(low, bearing), max(high, bearing), max(level, math.hypot(x, y))
-        step = 0.5 * float(np.median(rays[0, s + 1 : t] - rays[0, s : t - 1]))
-        for k in range(_lower(rays, s, t, low - step), _lower(rays, s, t, high + step)):
-            own = abs(r[k] - nearest[k]) < 4.0 * sigma and r[k] > level + 2.0 * sigma
-            passed += int(r[k] < 0.0 or r[k] > level + depth or own)
+        step = 0.5 * float(np.median(B[0, s + 1 : t] - B[0, s : t - 1]))
+        for k in range(_lower(B, s, t, low - step), _lower(B, s, t, high + step)):
+            r = B[RANGE, k]
+            own = abs(r - min(rho[0, k], rho[1, k])) < 4.0 * sigma and r > level + 2.0 * sigma
+            passed += int(r < 0.0 or r > level + depth or own)
             between += 1
     return passed if 2 * passed >= between else 0
+
+
+@jit
+def claim(
+    which: int, rho: Array, side: Ints, B: Array, eye: Array, start: Ints, usable: Mask, pose: Array,
+    level: float, sigma: float, amplitude: float, past: float,
+) -> tuple[Mask, Array]:  # fmt: skip
+    """Beams that speak for one component, and what they cost, once the other has been estimated.
+
+    Returns that the other explains count for it. Those on its side and above ``level`` may not be claimed
+    even by a surface that would explain them equally well, for two bodies do not fill the same place.
+
+    Parameters
+    ----------
+    which : int
+        The component: 0 for A.
+    pose : (3,)
+        Of the joint: ``level`` is measured along its v, m; inf where the other has no such place.
+    sigma, amplitude : float
+        Of a return from the other, as in :func:`log_likelihood`.
+    past : float
+        Log-odds of a beam that went past a face in its way.
+    """
+    n = rho.shape[1]
+    use, out = np.empty(n, np.bool_), B.copy()
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    v0 = sin * pose[0] - cos * pose[1]
+    for g in range(eye.shape[0]):
+        for k in range(start[g], start[g + 1]):
+            r, other = B[RANGE, k], rho[1 - which, k]
+            met, own = other < np.inf, side[k] == which
+            q = (r - other) / sigma
+            claimed = met and r > 0.0 and abs(r - other) < 4.0 * sigma
+            use[k] = usable[k] and (own or claimed or (r < 0.0 and not met))
+            out[LIMIT, k] = other + 3.0 * sigma
+            if r < 0.0 and met:
+                # a beam that the other should have returned speaks for neither when it did not
+                out[OFF, k] = 0.0
+            elif claimed:
+                out[OFF, k] -= math.log1p(amplitude * math.exp(-0.5 * q * q))
+                x, y = eye[g, 0] + B[1, k] * r, eye[g, 1] + B[2, k] * r
+                if not own and cos * y - sin * x + v0 > level:
+                    out[OFF, k] -= abs(past)
+    return use, out
 
 
 @jit_inner_sums
@@ -330,13 +543,13 @@ def _weight(t: float) -> float:
 
 
 @jit_sums
-def _total(B: Array, margin: float, rho: Array, face: Ints) -> float:
-    """Sum over covered beams of the residual's term and the cost of covering."""
+def _total(B: Array, inverse: float, top: float, margin: float, rho: Array, face: Ints) -> float:
+    """Sum over covered beams of the residual's term and the cost of covering, all with one sigma."""
     total = 0.0
     for k in range(np.uint64(face.shape[0])):
         z = B[RANGE, k] - rho[k]
-        q = z * B[INVERSE, k]
-        value = _gain(B[TOP, k] - 0.5 * q * q) + B[OFF, k] + (B[DEEP, k] if z > margin else 0.0)
+        q = z * inverse
+        value = _gain(top - 0.5 * q * q) + B[OFF, k] + (B[DEEP, k] if z > margin else 0.0)
         total += value if face[k] >= 0 else 0.0
     return total
 
@@ -599,22 +812,45 @@ def solve3(H: Array, g: Array, x: Array) -> None:
 
 @jit
 def slide(
-    edges_a: Array, edges_b: Array, pose: Array, steps: Array, B: Array, start: Ints, eye: Array,
-    margin: float, prior: float, scores: Array,
-) -> None:  # fmt: skip
-    """Score the union of both components at ``pose`` shifted by every (du, dv) row of ``steps``."""
+    edges_a: Array, edges_b: Array, pose: Array, shifts: Array, B: Array, start: Ints, eye: Array,
+    inverse: float, top: float, margin: float, prior: float, apart: float,
+) -> tuple[Array, int, int]:  # fmt: skip
+    """Score the union of both components at ``pose`` shifted along its u.
+
+    Parameters
+    ----------
+    inverse, top : float
+        1 / sigma and log A of every beam here.
+    prior : float
+        Standard deviation of a shift, m.
+
+    Returns
+    -------
+    scores : (k,)
+        Of the shifts.
+    best, other : int
+        The best, and the best of those more than ``apart`` from it; -1 for none.
+    """
     n = start[start.shape[0] - 1]
-    rho = np.empty(n)
-    face = np.empty(n, np.int64)
+    rho, face, scores = np.empty(n), np.empty(n, np.int64), np.empty(shifts.shape[0])
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    for i in range(steps.shape[0]):
+    best = 0
+    for i in range(shifts.shape[0]):
         rho[:] = np.inf
         face[:] = -1
-        tx, ty = pose[0] + steps[i, 0], pose[1] + steps[i, 1]
+        du, dv = shifts[i] * cos, shifts[i] * sin
+        tx, ty = pose[0] + du, pose[1] + dv
         predict(edges_a, cos, sin, tx, ty, B, start, eye, rho, face)
         predict(edges_b, cos, sin, tx, ty, B, start, eye, rho, face)
-        scores[i] = _total(B, margin, rho, face)
-        scores[i] -= 0.5 * (steps[i, 0] ** 2 + steps[i, 1] ** 2) / (prior * prior)
+        scores[i] = _total(B, inverse, top, margin, rho, face)
+        scores[i] -= 0.5 * (du * du + dv * dv) / (prior * prior)
+        if scores[i] > scores[best]:
+            best = i
+    other = -1
+    for i in range(shifts.shape[0]):
+        if abs(shifts[i] - shifts[best]) > apart and (other < 0 or scores[i] > scores[other]):
+            other = i
+    return scores, best, other
 
 
 @jit
@@ -764,20 +1000,8 @@ def component(
     out : (36,) out
         Pose (3), covariance (9), pivot (2), covariance about the pivot (9), info (12), radius.
     """
-    n = 0
-    for k in range(use.shape[0]):
-        n += int(use[k])
-    B = np.zeros((every.shape[0], n + PAD))
-    start2 = np.empty(start.shape[0], np.int64)
-    i = 0
-    for g in range(eye.shape[0]):
-        start2[g] = i
-        for k in range(start[g], start[g + 1]):
-            if use[k]:
-                for j in range(every.shape[0]):
-                    B[j, i] = every[j, k]
-                i += 1
-    start2[start.shape[0] - 1] = i
+    B, start2 = taken(every, start, use)
+    n = start2[-1]
     rho, face = np.full(n, np.inf), np.full(n, -1, np.int64)
     cos, sin = math.cos(at[2]), math.sin(at[2])
     predict(rows, cos, sin, at[0], at[1], B, start2, eye, rho, face)

@@ -61,76 +61,64 @@ def range_sd(
 
 @jit
 def residuals(
-    edges: Array,
-    pose: Array,
-    pivot: Array,
-    cov: Array,
-    rho: Array,
-    face: Ints,
-    other: Array,
-    used: Mask,
-    d: Array,
-    r: Array,
-    start: Ints,
-    eye: Array,
-    spacing: float,
-    sigma: float,
-    spread: Array,
+    which: int, edges: Array, pose: Array, pivot: Array, cov: Array, ranges: Array, edges_met: Ints,
+    side: Ints, usable: Mask, B: Array, start: Ints, eye: Array, spacing: float, sigma: float, spread: Array,
     sensor: Array,
-    out: Array,
-    z: Array,
-    places: Array,
-    faces: Ints,
-) -> int:
+) -> tuple[Array, Array, Array, Ints]:  # fmt: skip
     """Residuals of the returns on a component, and what they say of it.
 
     Parameters
     ----------
+    which : int
+        0 for A, 1 for B.
     edges, pose : (m, 6) and (3,)
         Of the designed component, and where it is.
     pivot, cov : (2,) and (3, 3)
         Its covariance about the pivot, for grazing returns.
-    rho, face, other : (n,)
-        Range to the component and the edge met, and the range to the other component, which may hide it.
-    spread : (n,)
-        What each range deviates by, m; residuals are brought to ``sigma``.
-    used : (n,)
-        Beams that speak for it; cleared where the other hides it.
+    ranges, edges_met : (2, n)
+        Range to each component and the edge met; the one may hide the other.
+    side, usable : (n,)
+        Whose each beam is, and whether it may speak.
+    B : (4 or more, n or more)
+        Beams: pseudo-angle, direction, range.
+    spread : (n,) or (0,)
+        How many times ``sigma`` each range deviates; residuals are brought to ``sigma``.
     sensor : (3,)
         Share of beams that return nothing or from elsewhere, how many neighbours do so together, and the
         greatest standard deviation, m, that a direction of the pose may have and still be fixed.
-    out : (FIGURES,) out
+
+    Returns
+    -------
+    figures : (FIGURES,)
         Beams, covered, inliers, rms, chi2, outlier share, miss share, their longest runs, cumulated
         range, lag 1, unexplained, edge; in the order of :class:`~bimfit.estimation.result.Residuals`; then
         excused returns, and of a face that the pose depends on without support: the edge (-1: none), its
         beams and inliers, and the direction that depends on it, in (u, v, theta * radius).
-    z, places, faces : (n,), (n, 2), (n,) out
+    z, places, faces : (k,), (k, 2), (k,)
         Residuals and places of the inliers, and the edge of each.
-
-    Returns
-    -------
-    int
-        How many rows of ``z``, ``places`` and ``faces`` are filled.
     """
-    n = r.shape[0]
+    n = side.shape[0]
+    out, z, places, faces = np.empty(FIGURES), np.empty(n), np.empty((n, 2)), np.empty(n, np.int64)
+    rho, other, face, r = ranges[which], ranges[1 - which], edges_met[which], B[3]
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    stray, missed = np.empty(n, np.bool_), np.empty(n, np.bool_)
+    used, stray, missed = np.empty(n, np.bool_), np.empty(n, np.bool_), np.empty(n, np.bool_)
     held = np.zeros((edges.shape[0], 3), np.int64)
     beams = covered = quiet_all = quiet = count = strays = misses = 0
     for q in range(eye.shape[0]):
         for k in range(start[q], start[q + 1]):
-            used[k] = used[k] and not other[k] < rho[k]
+            used[k] = side[k] == which and usable[k] and not other[k] < rho[k]
             if not used[k]:
                 continue
             beams += 1
             e = face[k]
             if e < 0:
                 continue
-            x, y = eye[q, 0] + d[0, k] * rho[k], eye[q, 1] + d[1, k] * rho[k]
+            dx, dy = B[1, k], B[2, k]
+            x, y = eye[q, 0] + dx * rho[k], eye[q, 1] + dy * rho[k]
             nx = cos * edges[e, 4] - sin * edges[e, 5]
             ny = sin * edges[e, 4] + cos * edges[e, 5]
-            own = spread[k]
-            sd, c = range_sd(nx, ny, d[0, k], d[1, k], x - pivot[0], y - pivot[1], cov)
+            own = sigma * spread[k] if spread.shape[0] > 0 else sigma
+            sd, c = range_sd(nx, ny, dx, dy, x - pivot[0], y - pivot[1], cov)
             misfit = r[k] - rho[k]
             if excused(r[k], rho[k], sd, c, own):
                 quiet_all += 1
@@ -147,8 +135,8 @@ def residuals(
                 held[e, 2] += int(r[k] > 0.0 and not inlier)
             if inlier:
                 z[count], faces[count] = misfit * (sigma / own), e
-                places[count, 0] = eye[q, 0] + d[0, k] * r[k]
-                places[count, 1] = eye[q, 1] + d[1, k] * r[k]
+                places[count, 0] = eye[q, 0] + dx * r[k]
+                places[count, 1] = eye[q, 1] + dy * r[k]
                 count += 1
     square, mean = 0.0, 0.0
     for i in range(count):
@@ -173,10 +161,10 @@ def residuals(
     out[14] = -1.0
     doubted = _least_supported(held, sensor[0], sensor[1])
     if doubted >= 0 and _depends(
-        edges, cos, sin, pivot, rho, face, used, d, r, start, eye, spread, doubted, sensor[2], out[17:]
+        edges, cos, sin, pivot, rho, face, used, B, start, eye, sigma, spread, doubted, sensor[2], out[17:]
     ):
         out[14], out[15], out[16] = doubted, held[doubted, 0], held[doubted, 1]
-    return count
+    return out, z[:count], places[:count], faces[:count]
 
 
 @jit
@@ -207,8 +195,8 @@ def _least_supported(held: Ints, lost: float, together: float) -> int:
 
 @jit
 def _depends(
-    edges: Array, cos: float, sin: float, pivot: Array, rho: Array, face: Ints, used: Mask, d: Array,
-    r: Array, start: Ints, eye: Array, spread: Array, doubted: int, most: float, axis: Array,
+    edges: Array, cos: float, sin: float, pivot: Array, rho: Array, face: Ints, used: Mask, B: Array,
+    start: Ints, eye: Array, sigma: float, spread: Array, doubted: int, most: float, axis: Array,
 ) -> bool:  # fmt: skip
     """Whether the returns on all other faces leave a direction open that the face ``doubted`` would fix.
 
@@ -227,20 +215,21 @@ def _depends(
                     continue
                 nx = cos * edges[e, 4] - sin * edges[e, 5]
                 ny = sin * edges[e, 4] + cos * edges[e, 5]
-                c = nx * d[0, k] + ny * d[1, k]
+                c = nx * B[1, k] + ny * B[2, k]
                 if c > -GRAZING:
                     continue
-                x, y = eye[q, 0] + d[0, k] * rho[k] - pivot[0], eye[q, 1] + d[1, k] * rho[k] - pivot[1]
+                x, y = eye[q, 0] + B[1, k] * rho[k] - pivot[0], eye[q, 1] + B[2, k] * rho[k] - pivot[1]
                 if not both:
                     square, count = square + x * x + y * y, count + 1
                     continue
                 g[0], g[1], g[2] = nx / c, ny / c, (ny * x - nx * y) / (c * radius)
+                own_sigma = sigma * spread[k] if spread.shape[0] > 0 else sigma
                 for i in range(3):
                     for j in range(3):
-                        add = g[i] * g[j] / (spread[k] * spread[k])
+                        add = g[i] * g[j] / (own_sigma * own_sigma)
                         if e == doubted:
                             own[i, j] += add
-                        elif r[k] > 0.0 and abs(r[k] - rho[k]) < 4.0 * spread[k]:
+                        elif B[3, k] > 0.0 and abs(B[3, k] - rho[k]) < 4.0 * own_sigma:
                             rest[i, j] += add
     if count == 0:
         return False

@@ -47,6 +47,7 @@ def judge_station(
     passed: int,
     reason: str,
     virtual: bool,
+    growth: float,
 ) -> StationEstimate:
     """Put a station together and say what may be believed of it."""
     made = [
@@ -73,6 +74,7 @@ def judge_station(
         slid.rival_odds,
         passed,
         virtual,
+        growth,
     )
 
 

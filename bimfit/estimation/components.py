@@ -11,18 +11,7 @@ import numpy as np
 from bimfit.config import FitConfig, SensorConfig
 from bimfit.estimation import checks
 from bimfit.estimation.context import Context, station_context
-from bimfit.estimation.likelihood import edge_rows
-from bimfit.estimation.ownership import (
-    Cost,
-    Ints,
-    Mask,
-    Scene,
-    cover_cost,
-    first_round,
-    meeting,
-    second_round,
-    split_side,
-)
+from bimfit.estimation.ownership import BeamTable, Mask, Sight, Views, second_round
 from bimfit.estimation.posterior import Posterior, Window, component_posterior
 from bimfit.estimation.residuals import residuals_of
 from bimfit.estimation.result import Residuals, StationEstimate
@@ -32,17 +21,14 @@ from bimfit.geometry.pose import Pose2D
 from bimfit.geometry.profile import Profile
 from bimfit.geometry.slice import Slice
 
-_FEW_THROUGH = 3
 _LOOSE = 5.0
+_SHALLOW = 3.0
+
+Pair = tuple[Posterior | None, Posterior | None]
 
 
 def components_at(
-    context: Context,
-    slice_: Slice,
-    slid: SlideResult,
-    cost: Cost,
-    matches: tuple[Pose2D | None, Pose2D | None],
-    reason: str,
+    context: Context, slid: SlideResult, matches: tuple[Pose2D | None, Pose2D | None]
 ) -> StationEstimate:
     """Estimate both components about a slid combined pose, and judge them.
 
@@ -50,54 +36,54 @@ def components_at(
     ----------
     matches : tuple of two (Pose2D or None)
         Each component's own search result: another place to start from.
-    reason : str
-        Why a hole between points is no evidence; empty where it is.
     """
-    pose, beams = slid.pose, context.beams
-    scene = context.scene((pose, pose))
-    side = split_side(scene, beams, np.array([pose.u, pose.v]))
-    usable = context.usable(scene, side, pose)
-    window = context.window
-    first: list[Posterior | None] = []
-    for which in (0, 1):
-        use = first_round(which, scene, side)
-        first.append(_one(context, which, pose, use & usable, cost, window, matches[which]))
-    posteriors = first
-    poses = [p.pose if p is not None else pose for p in posteriors]
-    scene = context.scene(poses)
-    passed = context.passed(poses, scene)
-    both = np.isfinite(scene.rho[0]) & np.isfinite(scene.rho[1])
-    if all(p is not None for p in first) and (
-        bool(np.any(both & usable)) or passed < _FEW_THROUGH or meeting(scene, _FEW_THROUGH)
-    ):
-        posteriors = list(first)
-        # near the mouth two bodies lie side by side; deep in a groove they meet, nobody knows just where
-        shallow = pose.inverse().apply(beams.points)[:, 1] > -3.0 * context.sensor.sigma
-        for which in (0, 1):
-            use, spent = second_round(
-                which, scene, side, beams, cost, context.model, territory=shallow & (passed > 0)
-            )
-            posteriors[which] = _one(context, which, pose, use & usable, spent, window, poses[which])
-            poses[which] = posteriors[which].pose if posteriors[which] is not None else pose  # type: ignore[union-attr]
-            scene = context.scene(poses)
-        passed = context.passed(poses, scene)
-    if reason:
-        posteriors = [p if p is None else _loosened(context, p) for p in posteriors]
-    residuals = [_residuals(context, which, scene, side, usable, posteriors[which]) for which in (0, 1)]
-    steps = [_corner_step(context, which, poses[which]) for which in (0, 1)]
+    pose = slid.pose
+    sight = context.look(pose)
+    a, b = (_one(context, which, pose, sight.first(which), None, matches[which]) for which in (0, 1))
+    views = context.weigh(_poses((a, b), pose), sight.usable)
+    if a is not None and b is not None and views.close:
+        a, b, views = _given_each_other(context, pose, sight, (a, b), views)
+    if context.reason:
+        a, b = (p if p is None else _loosened(context, p) for p in (a, b))
+    residuals = [_residuals(context, which, views, sight, p) for which, p in enumerate((a, b))]
+    steps = [_corner_step(context, which, p) for which, p in enumerate(_poses((a, b), pose))]
     return checks.judge_station(
-        slice_.s, context.section, slid, (posteriors[0], posteriors[1]), (residuals[0], residuals[1]),
-        (steps[0], steps[1]), window, context.sensor, context.fit, passed, reason, context.virtual,
+        context.slice.s, context.section, slid, (a, b), (residuals[0], residuals[1]), (steps[0], steps[1]),
+        context.window, context.sensor, context.fit, views.passed, context.reason, context.virtual,
+        context.growth,
     )  # fmt: skip
 
 
+def _poses(posteriors: Pair, pose: Pose2D) -> tuple[Pose2D, Pose2D]:
+    """Where the components are estimated to be, else the combined pose."""
+    a, b = posteriors
+    return (pose if a is None else a.pose, pose if b is None else b.pose)
+
+
+def _given_each_other(
+    context: Context, pose: Pose2D, sight: Sight, posteriors: Pair, views: Views
+) -> tuple[Posterior | None, Posterior | None, Views]:
+    """The second round: A given the first estimate of B, then B given the second of A."""
+    shallow, (a, b) = _shallow(context, views), posteriors
+    for which in (0, 1):
+        use, table = second_round(which, views, sight, context.table, context.model, pose, shallow)
+        found = _one(context, which, pose, use, table, _poses((a, b), pose)[which])
+        a, b = (found, b) if which == 0 else (a, found)
+        views = context.weigh(_poses((a, b), pose), sight.usable)
+    return a, b, views
+
+
+def _shallow(context: Context, views: Views) -> float:
+    """Height above which two bodies lie side by side; deep in a groove they meet, nobody knows just where."""
+    return -_SHALLOW * context.sensor.sigma if views.passed > 0 else math.inf
+
+
 def _one(
-    context: Context, which: int, prior: Pose2D, use: Mask, cost: Cost, window: Window,
-    begin: Pose2D | None,
-) -> Posterior | None:  # fmt: skip
+    context: Context, which: int, prior: Pose2D, use: Mask, table: BeamTable | None, begin: Pose2D | None
+) -> Posterior | None:
     """Posterior of one component from the beams in ``use``; None where hardly any meets it."""
     return component_posterior(
-        context.rows[which], prior, context.beams, cost, context.model, window, use=use, begin=begin
+        context.rows[which], prior, table or context.table, context.window, use=use, begin=begin
     )
 
 
@@ -125,20 +111,22 @@ def _corner_step(context: Context, which: int, pose: Pose2D) -> float:
     """
     if context.beams.spacing <= 0.0:
         return math.nan
-    x, y = pose.apply(context.section.gap.mouth[which]) - context.beams.eye[0, :2]
-    lx, ly = -context.beams.eye[0, :2] if context.virtual else context.beams.eye[0, 2:]
+    ox, oy, lx, ly = context.beams.eye[0].tolist()
+    if context.virtual:
+        lx, ly = -ox, -oy
+    x, y = pose.point(*context.section.gap.corners[which].tolist())
+    x, y = x - ox, y - oy
     return math.atan2(lx * y - ly * x, lx * x + ly * y) / context.beams.spacing
 
 
 def _residuals(
-    context: Context, which: int, scene: Scene, side: Ints, usable: Mask, posterior: Posterior | None
+    context: Context, which: int, views: Views, sight: Sight, posterior: Posterior | None
 ) -> Residuals:
     if posterior is None:
         return Residuals()
     return residuals_of(
-        context.rows[which], posterior, context.beams, (scene.rho[which], scene.face[which]),
-        scene.rho[1 - which], (side == which) & usable, context.sensor,
-        checks.FIXED * context.window.shift,
+        which, context.rows[which], posterior, context.table, views, sight, context.sensor,
+        context.beams.spread, checks.FIXED * context.window.shift,
     )  # fmt: skip
 
 
@@ -163,7 +151,7 @@ def reshaped(
     pose = station.combined
     if pose is None or station.components[which].pose is None:
         return [None] * len(profiles)
-    context, _ = station_context(section, slice_, pose, sensor, fit)
+    context = station_context(section, slice_, pose, sensor, fit)
     window = context.window
     # the combined pose was found with another shape, for which a prior about it would speak at every station
     window = dataclasses.replace(window, shift=_LOOSE * window.shift, angle=_LOOSE * window.angle)
@@ -180,22 +168,10 @@ def reshaped_with(
     window: Window,
 ) -> list[Posterior | None]:
     """The same with the station's own context, begun at a pose or where the component is."""
-    beams = context.beams
-    scene = context.scene((pose, pose))
-    side = split_side(scene, beams, np.array([pose.u, pose.v]))
-    usable = context.usable(scene, side, pose)
-    poses = [pose if c.pose is None else c.pose for c in station.components]
-    scene = context.scene(poses)
-    shallow = pose.inverse().apply(beams.points)[:, 1] > -3.0 * context.sensor.sigma
-    passed = context.passed(poses, scene)
-    cost = cover_cost(beams, context.model, context.depth)
-    use, spent = second_round(
-        which, scene, side, beams, cost, context.model, territory=shallow & (passed > 0)
-    )
+    sight = context.look(pose)
+    a, b = (pose if c.pose is None else c.pose for c in station.components)
+    views = context.weigh((a, b), sight.usable)
+    shallow = _shallow(context, views)
+    use, table = second_round(which, views, sight, context.table, context.model, pose, shallow)
     begin = begin or station.components[which].pose
-    return [
-        component_posterior(
-            edge_rows(profile), pose, beams, spent, context.model, window, use=use & usable, begin=begin
-        )
-        for profile in profiles
-    ]
+    return [component_posterior(p.rows, pose, table, window, use=use, begin=begin) for p in profiles]

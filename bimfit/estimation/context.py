@@ -4,22 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from bimfit.config import FitConfig, SensorConfig
-from bimfit.estimation import _kernels_inside as kernels
-from bimfit.estimation.cloud import irregular_sensor, virtual_beams
-from bimfit.estimation.likelihood import BeamModel, BeamSet, edge_rows
-from bimfit.estimation.ownership import (
-    Ints,
-    Mask,
-    Scene,
-    beside_artificial_ends,
-    through,
-)
+from bimfit.estimation import _kernels
+from bimfit.estimation.cloud import VirtualBeams, irregular_sensor, virtual_beams
+from bimfit.estimation.likelihood import BeamModel, BeamSet
+from bimfit.estimation.ownership import BeamTable, Mask, Sight, Views, beam_table, beside_artificial_ends
 from bimfit.estimation.posterior import Window
-from bimfit.estimation.slide import designed_width
 from bimfit.estimation.spread import with_spread
 from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.pose import Array, Pose2D
@@ -27,82 +21,127 @@ from bimfit.geometry.slice import Slice
 
 _UNKNOWN_RANGE = 1.0
 _GRAZING, _FAR_OUT = 0.3, 0.2
+_FEW_THROUGH = 3
 
 
 @dataclass(frozen=True)
 class Context:
-    """What every step of one station needs."""
+    """What every step of one station needs.
+
+    Attributes
+    ----------
+    section : JointSection
+        The design.
+    slice : Slice
+        What the scan shows.
+    beams : BeamSet
+    table : BeamTable
+        The same with what covering each costs while neither component is known.
+    model : BeamModel
+    sensor : SensorConfig
+        As it is at the slice's range, its neighbours pooled.
+    fit : FitConfig
+    growth : float
+        How many times the sensor's sigma at no range ``sensor.sigma`` is.
+    virtual : bool
+        Whether the beams were made up from points.
+    reason : str
+        Why a hole between points is no evidence; empty where it is.
+    """
 
     section: JointSection
+    slice: Slice
     beams: BeamSet
-    rows: tuple[Array, Array]
+    table: BeamTable
     model: BeamModel
     sensor: SensorConfig
     fit: FitConfig
+    growth: float
     virtual: bool
+    reason: str
+
+    @property
+    def rows(self) -> tuple[Array, Array]:
+        """Edges of both components as designed, (m, 6) each."""
+        a, b = self.section.components
+        return a.rows, b.rows
 
     @property
     def depth(self) -> float:
         """A return that much behind a surface went past it, m."""
-        return max(4.0 * self.sensor.sigma, 1.5 * self.fit.placement_sigma)
+        return self.table.margin
 
-    @property
+    @cached_property
     def window(self) -> Window:
         """The component's own window: it scales with the gap, but is never under the placement tolerance."""
         fit = self.fit
-        half = max(fit.gap_fraction * designed_width(self.section), fit.placement_tolerance)
+        half = max(fit.gap_fraction * self.section.gap.width, fit.placement_tolerance)
         return Window(0.64 * half, fit.component_angle / 1.5, 0.96 * half, 0.24 * half)
 
-    def scene(self, poses: Sequence[Pose2D]) -> Scene:
-        """Predicted ranges of both components at a pose each."""
-        return Scene.at(self.rows, poses, self.beams)
+    def look(self, pose: Pose2D) -> Sight:
+        """What the beams should see with both components at one pose, and which may speak for which.
 
-    def passed(self, poses: Sequence[Pose2D], scene: Scene) -> int:
-        """Beams that went in between the components' mouth corners."""
-        a, b = (pose.apply(m) for pose, m in zip(poses, self.section.gap.mouth, strict=True))
-        return through((a, b), self.beams, scene.nearest, self.depth, self.sensor.sigma)
-
-    def usable(self, scene: Scene, side: Ints, pose: Pose2D) -> Mask:
-        """Beams that may speak: away from ends that are no surface, and not grazing a face far out.
-
-        There a milliradian moves a range by millimetres: a ridge too sharp for the quadrature's cells.
+        Those may not that end beside what is no surface, nor those that graze a face far out: a milliradian
+        moves a range by millimetres there, a ridge too sharp for the quadrature's cells.
         """
-        components, beams = self.section.components, self.beams
-        surface = (components[0].surface, components[1].surface)
-        use = np.ones(len(beams), bool)
-        if not (surface[0].all() and surface[1].all()):
-            edges = (pose.apply(components[0].edges), pose.apply(components[1].edges))
+        table = self.table
+        sight = Sight(
+            *_kernels.look(
+                *self.rows, pose.as_array(), table.rows, table.start, table.eye, _GRAZING, _FAR_OUT
+            )
+        )
+        a, b = self.section.components
+        if a.artificial or b.artificial:
+            edges, surface = (pose.apply(a.edges), pose.apply(b.edges)), (a.surface, b.surface)
             margin = 2.0 * self.fit.placement_tolerance
-            use = ~beside_artificial_ends(scene, side, beams, edges, surface, margin)
-        kernels.far_grazing(
-            *self.rows, pose.as_array(), scene.ranges, scene.faces, beams.rays, beams.start, beams.eye,
-            _GRAZING, _FAR_OUT, use,
+            sight.may[:] &= ~beside_artificial_ends(sight, self.beams, edges, surface, margin)
+        return sight
+
+    def weigh(self, poses: Sequence[Pose2D], usable: Mask) -> Views:
+        """What the beams should see with a pose each, and how far apart that leaves the components."""
+        table = self.table
+        at = np.array([(pose.u, pose.v, pose.theta) for pose in poses])
+        return Views(
+            *_kernels.weigh(
+                *self.rows, at, self.section.gap.corners, table.rows, table.start, table.eye, usable,
+                self.depth, self.sensor.sigma, _FEW_THROUGH,
+            )
         )  # fmt: skip
-        return use
 
 
 def station_context(
     section: JointSection, slice_: Slice, combined: Pose2D, sensor: SensorConfig, fit: FitConfig
-) -> tuple[Context, str]:
-    """What every step needs, and why a hole between points is no evidence (empty where it is)."""
-    virtual, reason = None, ""
-    own, (sensor, distance) = sensor, sensor_here(sensor, slice_)
+) -> Context:
+    """What every step needs, from what the scan shows and about where the joint is."""
+    virtual: VirtualBeams | None = None
+    (here, distance), reason = sensor_here(sensor, slice_), ""
     if slice_.beams is None or len(slice_.beams.ranges) == 0:
         virtual = virtual_beams(slice_, combined)
         beams = BeamSet.of(virtual.beams)
         if not virtual.spacing_known and sensor.missing == "gap":
             reason = virtual.reason
-            sensor = irregular_sensor(sensor)
+            here = irregular_sensor(here)
     else:
         beams = BeamSet.of(slice_.beams)
     if sensor.missing == "unknown":
         beams = beams.take(beams.r > 0.0)
-    rows = (edge_rows(section.components[0]), edge_rows(section.components[1]))
-    grows = own.sigma_per_metre > 0.0
-    expected = Scene.at(rows, (combined, combined), beams).nearest if grows else None
-    beams = with_spread(beams, own, distance, expected)
-    context = Context(section, beams, rows, BeamModel.of(sensor), sensor, fit, virtual is not None)
-    return context, reason
+    if sensor.sigma_per_metre > 0.0 or sensor.correlation > 0.0:
+        beams = with_spread(beams, sensor, distance, _expected(section, beams, combined, sensor))
+    model = BeamModel.of(here)
+    table = beam_table(beams, model, max(4.0 * here.sigma, 1.5 * fit.placement_sigma))
+    return Context(
+        section, slice_, beams, table, model, here, fit, here.sigma / sensor.pooled().sigma,
+        virtual is not None, reason,
+    )  # fmt: skip
+
+
+def _expected(section: JointSection, beams: BeamSet, pose: Pose2D, sensor: SensorConfig) -> Array | None:
+    """Range that each beam should measure, m; None where sigma does not grow with it."""
+    if not sensor.sigma_per_metre > 0.0:
+        return None
+    (a, b), at = section.components, pose.as_array()
+    ranges, _ = _kernels.scene(a.rows, b.rows, at, at, beams.rays, beams.start, beams.eye)
+    return np.asarray(ranges.min(axis=0))
 
 
 def sensor_here(sensor: SensorConfig, slice_: Slice) -> tuple[SensorConfig, float]:

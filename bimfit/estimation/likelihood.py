@@ -23,6 +23,7 @@ from bimfit.geometry.slice import Beams
 Ints = NDArray[np.int64]
 _SHARE_FLOOR = 1e-3
 _MISSING = -1e9
+_SAME_ORIGIN = 1e-7
 
 
 @dataclass(frozen=True)
@@ -99,25 +100,16 @@ class BeamSet:
     @classmethod
     def of(cls, beams: Beams) -> BeamSet:
         """Sort the beams of a slice; one whose origin or direction is not a number is left out."""
-        whole = np.flatnonzero(
-            np.isfinite(beams.origins).all(axis=1) & np.isfinite(beams.directions).all(axis=1)
-        )
-        o = np.ascontiguousarray(beams.origins[whole], np.float64)
-        d = np.ascontiguousarray(beams.directions[whole], np.float64)
-        r = beams.ranges[whole]
-        r = np.where(np.isfinite(r), r, _MISSING)
-        n = len(r)
-        group = np.zeros(n, np.int64)
-        if n and float(np.abs(o - o[0]).max()) > 1e-7:
-            _, group = np.unique(np.round(o / 1e-7).astype(np.int64), axis=0, return_inverse=True)
-            group = np.asarray(group, np.int64).reshape(-1)
-        count = int(group.max()) + 1 if n else 0
-        eye, rays = np.empty((count, 4)), np.empty((3, n))
-        order = np.empty(n, np.int64)
-        start = np.zeros(count + 1, np.int64)
-        _kernels.sort_beams(o, d, group, count, eye, rays[0], order, start)
-        rays[1:] = d[order].T
-        return cls(rays, np.ascontiguousarray(r[order]), start, eye, whole[order])
+        o = np.ascontiguousarray(beams.origins, np.float64)
+        d = np.ascontiguousarray(beams.directions, np.float64)
+        r = np.ascontiguousarray(beams.ranges, np.float64)
+        whole, one = _kernels.whole_beams(o, d, _SAME_ORIGIN)
+        group = np.zeros(len(whole), np.int64)
+        if not one:
+            near = np.round(o[whole] / _SAME_ORIGIN).astype(np.int64)
+            group = np.unique(near, axis=0, return_inverse=True)[1].astype(np.int64).reshape(-1)
+        count = int(group.max()) + 1 if len(group) else 0
+        return cls(*_kernels.sort_beams(o, d, r, whole, group, count, _MISSING))
 
     def __len__(self) -> int:
         return len(self.r)

@@ -6,20 +6,12 @@ import dataclasses
 import math
 from collections.abc import Sequence
 
-import numpy as np
-
 from bimfit.estimation import checks
 from bimfit.estimation.components import components_at
 from bimfit.estimation.context import Context
-from bimfit.estimation.ownership import (
-    Cost,
-    cover_cost,
-    split_side,
-)
 from bimfit.estimation.result import StationEstimate
 from bimfit.estimation.slide import SlideResult, best_start
 from bimfit.geometry.pose import Pose2D
-from bimfit.geometry.slice import Slice
 
 _FAR_ALONG = 0.025
 _WORTH_A_LOOK = -15.0
@@ -27,40 +19,33 @@ _WORTH_A_LOOK = -15.0
 
 def placed(
     context: Context,
-    slice_: Slice,
     combined: Pose2D,
     matches: tuple[Pose2D | None, Pose2D | None],
     rivals: Sequence[Pose2D],
-    reason: str,
-) -> tuple[StationEstimate, Cost]:
-    """The best estimate near the combined pose and its rivals, and what covering a beam costs."""
-    slid, cost = max(
-        (_place(context, combined, rivals), *(_place(context, pose, ()) for pose in _home(combined))),
-        key=lambda placed: float(placed[0].scores.max()),
+) -> StationEstimate:
+    """The best estimate near the combined pose and its rivals."""
+    slid = max(
+        (_slid(context, combined, rivals), *(_slid(context, pose, ()) for pose in _home(combined))),
+        key=lambda place: place.score,
     )
-    best = components_at(context, slice_, slid, cost, matches, reason)
+    best = components_at(context, slid, matches)
     if slid.rival is None or slid.rival_odds < _WORTH_A_LOOK:
-        return best, cost
+        return best
     # the slide's blur cannot tell the two apart for certain; both fitted at the sensor's sigma can
-    turned = dataclasses.replace(slid, pose=slid.rival, rival=slid.pose)
-    other = components_at(context, slice_, turned, cost, (None, None), reason)
+    other = components_at(context, dataclasses.replace(slid, pose=slid.rival, rival=slid.pose), (None, None))
     odds = _evidence(other) - _evidence(best)
     if best.status.measured and not other.status.measured:
-        return best, cost  # what explains more by being impossible is no rival
+        return best  # what explains more by being impossible is no rival
     if odds > 0.0 or (other.status.measured and not best.status.measured):
         best, odds = other, -abs(odds)
-    return checks.with_rival(best, odds), cost
+    return checks.with_rival(best, odds)
 
 
-def _place(context: Context, combined: Pose2D, rivals: Sequence[Pose2D]) -> tuple[SlideResult, Cost]:
-    """Slide the combined pose and its rivals; what covering a beam costs there."""
-    scene = context.scene((combined, combined))
-    side = split_side(scene, context.beams, np.array([combined.u, combined.v]))
-    cost = cover_cost(context.beams, context.model, context.depth)
-    usable = context.usable(scene, side, combined)
-    beams, used = (context.beams, cost) if usable.all() else (context.beams.take(usable), cost.take(usable))
-    slid = best_start(context.section, beams, used, (combined, *rivals), context.sensor, context.fit)
-    return slid, cost
+def _slid(context: Context, combined: Pose2D, rivals: Sequence[Pose2D]) -> SlideResult:
+    """Slide the combined pose and its rivals, by the beams that may speak there."""
+    usable = context.look(combined).usable
+    table = context.table if usable.all() else context.table.take(usable)
+    return best_start(context.section, table, (combined, *rivals), context.sensor, context.fit)
 
 
 def _home(combined: Pose2D) -> tuple[Pose2D, ...]:

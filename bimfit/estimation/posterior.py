@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bimfit.estimation import _kernels
-from bimfit.estimation.likelihood import BeamModel, BeamSet
-from bimfit.estimation.ownership import Cost, packed
+from bimfit.estimation.ownership import BeamTable
 from bimfit.geometry.pose import Array, Pose2D
 
 _CELLS = 24
@@ -41,6 +40,11 @@ class Window:
     reach: float = 0.012
     least: float = 0.003
 
+    @cached_property
+    def deviations(self) -> Array:
+        """Prior standard deviations in u, v (m) and theta (rad), shape (3,)."""
+        return np.array([self.shift, self.shift, self.angle])
+
 
 @dataclass(frozen=True)
 class Heard:
@@ -50,19 +54,35 @@ class Heard:
     ----------
     rows : ndarray, shape (m, 6)
         Edges of the designed component.
-    beams : ndarray, shape (9, k)
-        As the kernels take them (:func:`bimfit.estimation.ownership.packed`).
-    origin : ndarray, shape (2, k)
-        Where each starts from.
-    margin, bearing : float
-        How far behind a surface a return went past it, m, and the blur of a bearing, rad.
+    table : BeamTable
+        All beams of the slice.
+    use : ndarray of bool, shape (n,)
+        Those that spoke.
     """
 
     rows: Array
-    beams: Array
-    origin: Array
-    margin: float
-    bearing: float
+    table: BeamTable
+    use: NDArray[np.bool_]
+
+    @property
+    def beams(self) -> Array:
+        """Those that spoke, shape (9, k), see :class:`~bimfit.estimation.ownership.BeamTable`."""
+        return np.asarray(self.table.rows[:, : len(self.table)][:, self.use])
+
+    @property
+    def origin(self) -> Array:
+        """Where each starts from, shape (2, k)."""
+        return np.asarray(self.table.origins[:, self.use])
+
+    @property
+    def margin(self) -> float:
+        """How far behind a surface a return went past it, m."""
+        return self.table.margin
+
+    @property
+    def bearing(self) -> float:
+        """Standard deviation of a bearing, rad."""
+        return _BEARING * self.table.spacing
 
 
 @dataclass(frozen=True)
@@ -126,9 +146,7 @@ def _draws() -> Array:
 def component_posterior(
     rows: Array,
     start: Pose2D,
-    beams: BeamSet,
-    cost: Cost,
-    model: BeamModel,
+    table: BeamTable,
     window: Window,
     *,
     use: NDArray[np.bool_] | None = None,
@@ -143,8 +161,8 @@ def component_posterior(
     start : Pose2D
         The pose that the prior is centred on. The centroid of the returns near the component there becomes
         the pivot.
-    cost : Cost
-        What covering each beam adds to the log-likelihood.
+    table : BeamTable
+        The beams, and what covering each adds to the log-likelihood.
     use : ndarray of bool, shape (n,), optional
         Beams that speak for the component; all unless told.
     begin : Pose2D, optional
@@ -157,12 +175,11 @@ def component_posterior(
     """
     other = _NOWHERE if begin is None else begin.as_array()
     out = np.empty(36)
-    speak = np.ones(len(beams), bool) if use is None else use
-    every, bearing = packed(beams, cost, model), _BEARING * beams.spacing
+    speak = np.ones(len(table), bool) if use is None else use
     found = _kernels.component(
-        rows, start.as_array(), other, speak, every, beams.start, beams.eye, cost.margin, _NEAR, _MIN_HITS,
-        bearing, np.array([window.shift, window.shift, window.angle]), window.reach,
-        window.least, _CELLS, _draws(), out,
+        rows, start.as_array(), other, speak, table.rows, table.start, table.eye, table.margin, _NEAR,
+        _MIN_HITS, _BEARING * table.spacing, window.deviations, window.reach, window.least, _CELLS, _draws(),
+        out,
     )  # fmt: skip
     if not found:
         return None
@@ -181,5 +198,5 @@ def component_posterior(
         rival_offset=offset,
         radius=radius,
         ess=ess,
-        heard=Heard(rows, every[:, : len(beams)][:, speak], beams.origins[:, speak], cost.margin, bearing),
+        heard=Heard(rows, table, speak),
     )

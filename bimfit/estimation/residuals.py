@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bimfit.config import SensorConfig
 from bimfit.estimation import _kernels_residuals as kernels
-from bimfit.estimation.likelihood import BeamSet
+from bimfit.estimation.ownership import BeamTable, Sight, Views
 from bimfit.estimation.posterior import Posterior
 from bimfit.estimation.result import Residuals, Unsupported
 from bimfit.geometry.pose import Array
 
+_ALIKE: Array = np.zeros(0)
+
 
 def residuals_of(
+    which: int,
     rows: Array,
     posterior: Posterior,
-    beams: BeamSet,
-    met: tuple[Array, NDArray[np.int64]],
-    other: Array,
-    used: NDArray[np.bool_],
+    table: BeamTable,
+    views: Views,
+    sight: Sight,
     sensor: SensorConfig,
+    spread: Array | None,
     fixed: float,
 ) -> Residuals:
     """Residual statistics of the returns that speak for one component.
@@ -30,33 +32,37 @@ def residuals_of(
 
     Parameters
     ----------
+    which : int
+        0 for A, 1 for B.
     rows : ndarray, shape (m, 6)
         Edges of the designed component.
-    met : tuple of ndarray, shape (n,)
-        Range to the component where it is estimated to be, and the edge met.
-    other : ndarray, shape (n,)
-        Range to the other component, which may hide it.
-    used : ndarray of bool, shape (n,)
-        Beams that may speak for it.
+    views : Views
+        What beams should see of both components where they are estimated to be.
+    sight : Sight
+        Which of them may speak for which.
     sensor : SensorConfig
-        Where beams differ in sigma (``beams.spread``), residuals are given as they would be at the sensor's.
+        Where beams differ in sigma (``spread``, how many times it each has), residuals are given as they
+        would be at the sensor's.
     fixed : float
         Greatest standard deviation of a direction that counts as fixed, m.
     """
-    n, sigma = len(beams), sensor.sigma
     lost = min(max(sensor.miss_share + sensor.outlier_share, 0.01), 0.9)
-    about = np.array([lost, sensor.outlier_run, fixed])
-    sd = np.full(n, sigma) if beams.spread is None else sigma * beams.spread
-    out, z, places = np.empty(kernels.FIGURES), np.empty(n), np.empty((n, 2))
-    faces = np.empty(n, np.int64)
-    count = kernels.residuals(
-        rows, posterior.pose.as_array(), posterior.pivot, posterior.pivot_covariance, met[0], met[1], other,
-        used.copy(), beams.d, beams.r, beams.start, beams.eye, beams.spacing, sigma, sd, about, out, z,
-        places, faces,
+    f, z, places, faces = kernels.residuals(
+        which, rows, posterior.pose.as_array(), posterior.pivot, posterior.pivot_covariance, views.ranges,
+        views.faces, sight.side, sight.usable, table.rows, table.start, table.eye, table.spacing,
+        sensor.sigma, _ALIKE if spread is None else spread, np.array([lost, sensor.outlier_run, fixed]),
     )  # fmt: skip
-    f = out.tolist()
+    figures = f.tolist()
+    n_beams, n_covered, n_inliers = (int(x) for x in figures[:3])
+    rms, chi2, strays, misses, stray_run, miss_run, cusum, lag1, unexplained, edge = figures[3:13]
     return Residuals(
-        int(f[0]), int(f[1]), int(f[2]), f[3], f[4], f[5], f[6], int(f[7]), int(f[8]), f[9], f[10],
-        int(f[11]), f[12], z[:count], places[:count], faces[:count],
-        None if f[14] < 0.0 else Unsupported(int(f[14]), int(f[15]), int(f[16]), out[17:20]),
+        n_beams, n_covered, n_inliers, rms, chi2, strays, misses, int(stray_run), int(miss_run), cusum, lag1,
+        int(unexplained), edge, z, places, faces,
+        _unsupported(f),
     )  # fmt: skip
+
+
+def _unsupported(figures: Array) -> Unsupported | None:
+    """The face that the pose depends on without support, if there is one."""
+    face, beams, inliers = (int(x) for x in figures[14:17].tolist()) if figures[14] >= 0.0 else (-1, 0, 0)
+    return None if face < 0 else Unsupported(face, beams, inliers, figures[17:20])

@@ -85,24 +85,18 @@ def _estimated(
     rivals: Sequence[Pose2D],
 ) -> StationEstimate:
     """The estimate of a slice that has enough returns and a combined pose."""
-    context, reason = station_context(section, slice_, combined, sensor, fit)
-    growth = context.sensor.sigma / sensor.pooled().sigma
-    beams, sensor = context.beams, context.sensor
-    best, cost = placed(context, slice_, combined, component_matches, rivals, reason)
-    best = _with_inside(context, slice_, best)
-    best = dataclasses.replace(best, growth=growth)
+    context = station_context(section, slice_, combined, sensor, fit)
+    best = _with_inside(context, placed(context, combined, component_matches, rivals))
     if not best.status.measured or best.combined is None:
         return best
     others = []
-    for place in gap_places(section, beams, best.combined):
-        there = best_start(section, beams, cost, (place,), sensor, fit)
-        other = components_at(context, slice_, there, cost, (None, None), reason)
-        other = _with_inside(context, slice_, other)
-        others.append(dataclasses.replace(other, growth=growth))
+    for place in gap_places(section, context.beams, best.combined):
+        there = best_start(section, context.table, (place,), context.sensor, fit)
+        others.append(_with_inside(context, components_at(context, there, (None, None))))
     return with_lookalikes(best, others, fit.joint_sigma)
 
 
-def _with_inside(context: Context, slice_: Slice, station: StationEstimate) -> StationEstimate:
+def _with_inside(context: Context, station: StationEstimate) -> StationEstimate:
     """The station, judged by what is inside its gap and by the edges of its mouth."""
 
     def reshape(which: int, profiles: Sequence[Profile], begin: Pose2D | None) -> list[Posterior | None]:
@@ -110,7 +104,7 @@ def _with_inside(context: Context, slice_: Slice, station: StationEstimate) -> S
         return reshaped_with(context, station, station.combined, which, profiles, begin, context.window)
 
     sigma = context.sensor.sigma
-    return with_inside(station, context.section, context.beams, sigma, slice_.sweeps, reshape)
+    return with_inside(station, context.section, context.beams, sigma, context.slice.sweeps, reshape)
 
 
 def _finite(c: ComponentEstimate) -> bool:

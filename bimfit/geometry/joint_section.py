@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
 
 from bimfit.geometry.frame import SectionFrame
 from bimfit.geometry.pose import Array
@@ -34,6 +38,17 @@ class GapOutline:
     def root(self) -> tuple[Array, Array]:
         """The root corners of A and B."""
         return self.side_a[-1], self.side_b[-1]
+
+    @cached_property
+    def width(self) -> float:
+        """Designed width between the mouth corners, m."""
+        a, b = self.mouth
+        return math.hypot(b[0] - a[0], b[1] - a[1])
+
+    @cached_property
+    def corners(self) -> Array:
+        """The mouth corners of A and B, shape (2, 2); never changed."""
+        return np.array([self.side_a[0], self.side_b[0]], np.float64)
 
 
 @dataclass(frozen=True)

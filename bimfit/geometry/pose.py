@@ -45,6 +45,11 @@ class Pose2D:
         """Move points of shape (..., 2)."""
         return np.asarray(np.asarray(points, float) @ self.rotation.T + (self.u, self.v))
 
+    def point(self, u: float, v: float) -> tuple[float, float]:
+        """Move one point given by its coordinates: :meth:`apply` without arrays."""
+        c, s = math.cos(self.theta), math.sin(self.theta)
+        return c * u - s * v + self.u, s * u + c * v + self.v
+
     def turn(self, vectors: ArrayLike) -> Array:
         """Rotate direction vectors of shape (..., 2)."""
         return np.asarray(np.asarray(vectors, float) @ self.rotation.T)

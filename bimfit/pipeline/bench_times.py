@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 
 from bimfit.config import Config
+from bimfit.estimation.context import station_context
 from bimfit.estimation.inside import drop_at_mouth, place_sd, returns_inside
-from bimfit.estimation.likelihood import BeamModel, BeamSet, edge_rows
 from bimfit.estimation.lookalikes import gap_places
 from bimfit.estimation.motion import estimate_joint
-from bimfit.estimation.ownership import Scene, cover_cost, first_round, split_side
-from bimfit.estimation.posterior import Window, component_posterior
+from bimfit.estimation.posterior import component_posterior
 from bimfit.estimation.slide import slide_combined
 from bimfit.gap.section import gap_section
 from bimfit.geometry.joint_section import JointSection
@@ -27,7 +26,6 @@ from bimfit.registration.matchers import match_all
 from bimfit.simulation.accuracy import PAPER_SECONDS_A_SLICE
 
 _ROUNDS = 3
-_MARGIN = 0.012
 _MANY = 1000
 
 
@@ -129,17 +127,14 @@ def _stages(fit: StationFit, config: Config) -> dict[str, Callable[[], Any]]:
     """The stages of one station's estimate that can be run by themselves."""
     station, section, sensor = fit.estimate, fit.section, config.sensor
     assert station is not None and station.combined is not None and fit.slice.beams is not None
-    pose, beams, model = station.combined, BeamSet.of(fit.slice.beams), BeamModel.of(sensor)
-    rows = (edge_rows(section.components[0]), edge_rows(section.components[1]))
-    scene = Scene.at(rows, (pose, pose), beams)
-    side = split_side(scene, beams, np.array([pose.u, pose.v]))
-    cost = cover_cost(beams, model, _MARGIN)
-    uses = [first_round(which, scene, side) for which in (0, 1)]
+    pose = station.combined
+    context = station_context(section, fit.slice, pose, sensor, config.fit)
+    sight, beams = context.look(pose), context.beams
     a, b = station.components
 
     def posteriors() -> None:
-        for own, use in zip(rows, uses, strict=True):
-            component_posterior(own, pose, beams, cost, model, Window(), use=use)
+        for which, own in enumerate(context.rows):
+            component_posterior(own, pose, context.table, context.window, use=sight.first(which))
 
     def checks() -> None:
         drop_at_mouth(section, station, sensor.sigma)
@@ -153,6 +148,6 @@ def _stages(fit: StationFit, config: Config) -> dict[str, Callable[[], Any]]:
             gap_section(section.s, section.frame, section.gap, a.pose, b.pose, a.covariance, b.covariance)
 
     def slide() -> None:
-        slide_combined(section, beams, cost, pose, sensor, config.fit)
+        slide_combined(section, context.table, pose, sensor, config.fit)
 
     return {"slide": slide, "posteriors": posteriors, "checks": checks, "gap": gap}

@@ -13,7 +13,7 @@ import shapely
 from bimfit.config import SensorConfig
 from bimfit.estimation import _kernels
 from bimfit.estimation.likelihood import BeamModel, BeamSet, edge_rows, predict_ranges
-from bimfit.estimation.ownership import Cost, packed
+from bimfit.estimation.ownership import beam_table
 from bimfit.estimation.posterior import Window, component_posterior
 from bimfit.geometry.pose import Pose2D
 from bimfit.geometry.profile import Profile
@@ -91,17 +91,23 @@ def _seen(pose=HOME, sigma=0.003, seed=1, profile=BOARD):
     rng = np.random.default_rng(seed)
     rho = _shapely_ranges(profile.moved(pose), beams)
     r = np.where(np.isfinite(rho), rho + rng.normal(0.0, sigma, len(rho)), np.nan)
-    set_ = BeamSet.of(Beams(beams.origins, beams.directions, r))
-    set_ = set_.take(set_.d[0] > 0.0)
+    right = beams.directions[:, 0] > 0.0
+    set_ = BeamSet.of(Beams(beams.origins[right], beams.directions[right], r[right]))
     model = BeamModel.of(SensorConfig(sigma=sigma))
-    n = len(set_)
-    cost = Cost(np.where(set_.r < 0.0, model.miss, 0.0), np.zeros(n), 1.0, np.full(n, np.inf))
-    return set_, model, cost
+    return set_, model, beam_table(set_, model, 1.0)
+
+
+def _with(table, **rows):
+    """The table with rows of its own: the cost of covering, the limit."""
+    out = table.rows.copy()
+    for name, values in rows.items():
+        out[getattr(_kernels, name.upper()), : len(table)] = values
+    return dataclasses.replace(table, rows=out)
 
 
 def test_information_of_a_flat_face_is_the_closed_form():
     """METHOD section 5: g = [cos a / cos b, sin a / cos b, rho tan b], I = sum g g^T / sigma^2."""
-    set_, model, cost = _seen(sigma=1e-4)
+    set_, model, _ = _seen(sigma=1e-4)
     rho, face = predict_ranges(edge_rows(BOARD), set_)
     top = (face == 3) & (set_.r > 0.0)
     phi = np.arctan2(set_.d[1], set_.d[0])[top]
@@ -117,24 +123,24 @@ def test_information_of_a_flat_face_is_the_closed_form():
     rows = edge_rows(BOARD, Pose2D(0.0, -0.25, 0.0))
     exact = dataclasses.replace(local, r=np.where(top, rho, -1e9))
     _kernels.normal_equations(
-        rows, np.zeros(3), 1.0, packed(exact, cost, model), local.start, local.eye, 1.0, 1 << 40, 0.0,
+        rows, np.zeros(3), 1.0, beam_table(exact, model, 1.0).rows, local.start, local.eye, 1.0, 1 << 40, 0.0,
         *_kernels.scratch(rows, local.eye), H, b,
     )  # fmt: skip
     assert np.allclose(np.abs(H), np.abs(expected), rtol=1e-3, atol=1e-3 * np.abs(expected).max())
     assert np.allclose(np.diag(H), np.diag(expected), rtol=1e-3)
 
 
-def _lattice(rows, pivot, radius, set_, model, cost, window, around, half, n=41):
+def _lattice(rows, pivot, table, window, around, half, n=41):
     """Mean and covariance by brute force over a dense lattice of (u, v, theta) about the pivot."""
     grid = [np.linspace(m - h, m + h, n) for m, h in zip(around, half, strict=True)]
     X = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1).reshape(-1, 3)
-    local = set_.moved_origin(pivot)
+    eye = table.eye.copy()
+    eye[:, :2] -= pivot
     moved = rows.copy()
     moved[:, 0:2] -= pivot
     moved[:, 2:4] -= pivot
-    after = (local.start, local.eye, cost.margin, 0.05 * set_.spacing, *_kernels.scratch(moved, local.eye))
-    B = packed(local, cost, model)
-    value = np.array([_kernels.log_likelihood(moved, x, B, *after) for x in X])
+    after = (table.rows, table.start, eye, table.margin, 0.05 * table.spacing, *_kernels.scratch(moved, eye))
+    value = np.array([_kernels.log_likelihood(moved, x, *after) for x in X])
     value -= 0.5 * np.sum((X / (window.shift, window.shift, window.angle)) ** 2, axis=1)
     w = np.exp(value - value.max())
     w /= w.sum()
@@ -145,26 +151,24 @@ def _lattice(rows, pivot, radius, set_, model, cost, window, around, half, n=41)
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_quadrature_agrees_with_a_dense_lattice(seed):
     truth = Pose2D.about((0.0125, 0.0), 0.002, -0.003, math.radians(1.5))
-    set_, model, cost = _seen(truth, seed=seed)
+    _, _, table = _seen(truth, seed=seed)
     window = Window()
     rows = edge_rows(BOARD)
-    result = component_posterior(rows, Pose2D(), set_, cost, model, window)
+    result = component_posterior(rows, Pose2D(), table, window)
     sd = np.sqrt(np.diag(result.pivot_covariance))
     delta = np.array([*(result.pose.apply(result.pivot) - result.pivot), result.pose.theta])
-    mean, cov = _lattice(
-        rows, result.pivot, result.radius, set_, model, cost, window, delta, 4.5 * sd + (4e-4, 0.0, 0.0)
-    )
+    mean, cov = _lattice(rows, result.pivot, table, window, delta, 4.5 * sd + (4e-4, 0.0, 0.0))
     assert np.all(np.abs(mean - delta) < 0.15 * sd)
     assert np.allclose(np.sqrt(np.diag(cov)), sd, rtol=0.12)
 
 
 def test_posterior_does_not_depend_on_where_the_frame_is():
-    set_, model, cost = _seen(Pose2D(0.001, 0.002, 0.01))
-    one = component_posterior(edge_rows(BOARD), Pose2D(), set_, cost, model, Window())
+    set_, model, table = _seen(Pose2D(0.001, 0.002, 0.01))
+    one = component_posterior(edge_rows(BOARD), Pose2D(), table, Window())
     shift = np.array([3.0, -7.0])
     far = set_.moved_origin(-shift)
     rows = edge_rows(BOARD.moved(Pose2D(*shift, 0.0)))
-    two = component_posterior(rows, Pose2D(), far, cost, model, Window())
+    two = component_posterior(rows, Pose2D(), beam_table(far, model, 1.0), Window())
     corner = np.array([0.0125, 0.0])
     assert np.allclose(two.pose.apply(corner + shift) - shift, one.pose.apply(corner), atol=1e-8)
     J = np.eye(3)
@@ -174,7 +178,7 @@ def test_posterior_does_not_depend_on_where_the_frame_is():
 
 
 def test_kernels_do_what_their_python_does():
-    set_, model, cost = _seen(Pose2D(0.001, 0.002, 0.01))
+    set_, model, table = _seen(Pose2D(0.001, 0.002, 0.01))
     rows = edge_rows(BOARD)
     n = len(set_)
     rho, face = np.full(n, np.inf), np.full(n, -1, np.int64)
@@ -184,15 +188,14 @@ def test_kernels_do_what_their_python_does():
     _kernels.predict.py_func(*args, slow, slow_face)
     assert np.array_equal(face, slow_face)
     assert np.allclose(rho[face >= 0], slow[face >= 0], rtol=1e-12)
-    B = packed(set_, cost, model)
-    common = (rows, np.array([1e-3, -2e-3, 0.02]), B, set_.start, set_.eye, cost.margin)
+    common = (rows, np.array([1e-3, -2e-3, 0.02]), table.rows, set_.start, set_.eye, table.margin)
     space = _kernels.scratch(rows, set_.eye)
     fast = _kernels.log_likelihood(*common, 3e-4, *space)
     assert fast == pytest.approx(_kernels.log_likelihood.py_func(*common, 3e-4, *space), rel=1e-12)
     covered = face >= 0
     d2 = ((set_.r - rho) / model.sigma) ** 2
     a = model.amplitude * np.exp(-0.5 * d2)
-    naive = np.sum(np.where(covered, np.log1p(a) + cost.off, 0.0))
+    naive = np.sum(np.where(covered, np.log1p(a) + table.rows[_kernels.OFF, :n], 0.0))
     flat = _kernels.log_likelihood(*common, 0.0, *space)
     assert flat == pytest.approx(naive, abs=1e-3)
 
@@ -213,26 +216,26 @@ def test_stretches_of_beams_meet_the_edges_that_are_predicted_beam_by_beam(eye):
     assert len(np.unique(face)) > 3
     seen = dataclasses.replace(set_, r=np.where(face >= 0, rho, 0.5) + rng.normal(0.0, 0.003, len(set_)))
     limit = np.where(rng.random(len(set_)) < 0.1, 0.01, np.inf)
-    cost = Cost(rng.normal(0.0, 1.0, len(set_)), np.zeros(len(set_)), 1.0, limit)
+    off = rng.normal(0.0, 1.0, len(set_))
+    table = _with(beam_table(seen, model, 1.0), off=off, deep=0.0, limit=limit)
     total = _kernels.log_likelihood(
-        rows, np.zeros(3), packed(seen, cost, model), seen.start, seen.eye, cost.margin, 0.0,
+        rows, np.zeros(3), table.rows, seen.start, seen.eye, table.margin, 0.0,
         *_kernels.scratch(rows, seen.eye),
     )  # fmt: skip
     covered = (face >= 0) & (rho < limit)
     odds = math.log(model.amplitude) - 0.5 * ((seen.r - rho)[covered] / model.sigma) ** 2
-    assert total == pytest.approx(np.sum(np.logaddexp(0.0, odds) + cost.off[covered]), abs=1e-2)
+    assert total == pytest.approx(np.sum(np.logaddexp(0.0, odds) + off[covered]), abs=1e-2)
 
 
 def test_a_return_from_behind_counts_only_where_something_should_have_stopped_it():
     set_, model, _ = _seen()
-    n = len(set_)
     rows = edge_rows(BOARD)
     rho, face = predict_ranges(rows, set_)
     covered = face >= 0
     behind = np.where(np.isfinite(rho), rho + 0.1, 0.6)
-    cost = Cost(np.zeros(n), np.full(n, model.past), 0.012, np.full(n, np.inf))
-    B = packed(dataclasses.replace(set_, r=behind), cost, model)
+    table = beam_table(dataclasses.replace(set_, r=behind), model, 0.012)
+    B = _with(table, off=0.0, deep=model.past).rows
     total = _kernels.log_likelihood(
-        rows, np.zeros(3), B, set_.start, set_.eye, cost.margin, 0.0, *_kernels.scratch(rows, set_.eye)
+        rows, np.zeros(3), B, set_.start, set_.eye, table.margin, 0.0, *_kernels.scratch(rows, set_.eye)
     )
     assert total == pytest.approx(model.past * covered.sum(), rel=1e-9)

@@ -14,7 +14,7 @@ from bimfit.config import FitConfig, SensorConfig
 from bimfit.estimation import _kernels
 from bimfit.estimation.likelihood import BeamModel, BeamSet, edge_rows
 from bimfit.estimation.motion import estimate_joint
-from bimfit.estimation.ownership import cover_cost, packed
+from bimfit.estimation.ownership import beam_table
 from bimfit.estimation.pooled import Beams, pooled
 from bimfit.estimation.posterior import Heard
 from bimfit.estimation.station import estimate_station
@@ -50,24 +50,26 @@ def _beams(section, slice_, which):
     """All beams of a slice as one component hears them, and their log-likelihood at a motion of it."""
     beams = BeamSet.of(slice_.beams)
     model = BeamModel.of(SensorConfig())
-    cost = cover_cost(beams, model, 0.012)
-    cost = dataclasses.replace(cost, limit=np.where(np.arange(len(beams)) % 9 == 4, 0.27, np.inf))
-    every, rows = packed(beams, cost, model), edge_rows(section.components[which])
-    heard = Heard(rows, every[:, : len(beams)], beams.origins, cost.margin, 3e-4)
+    table, rows = beam_table(beams, model, 0.012), edge_rows(section.components[which])
+    every = table.rows.copy()
+    every[_kernels.LIMIT, : len(beams)] = np.where(np.arange(len(beams)) % 9 == 4, 0.27, np.inf)
+    table = dataclasses.replace(table, rows=every, spacing=6e-3)
+    heard = Heard(rows, table, np.ones(len(beams), bool))
+    assert heard.bearing == pytest.approx(3e-4)
     corner = section.gap.mouth[which]
 
     def likelihood(x):
         pose = Pose2D.about(corner, *x).as_array()
         lines, runs = _kernels.scratch(rows, beams.eye)
         return _kernels.log_likelihood(
-            rows, pose, every, beams.start, beams.eye, cost.margin, 3e-4, lines, runs
+            rows, pose, every, beams.start, beams.eye, table.margin, 3e-4, lines, runs
         )
 
     moved = [rows - np.r_[corner, corner, 0.0, 0.0], heard.beams, beams.origins - corner[:, None]]
     ends = [np.array([0, len(m)]) for m in (rows, beams.r)]
     packed_up = Beams(
         moved[0], ends[0], moved[1], np.ascontiguousarray(moved[2]), ends[1],
-        np.array([cost.margin]), np.array([3e-4]),
+        np.array([table.margin]), np.array([3e-4]),
     )  # fmt: skip
     return packed_up, likelihood
 
