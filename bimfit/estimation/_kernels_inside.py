@@ -187,6 +187,7 @@ def holes(
     start: Ints,
     eye: Array,
     level: float,
+    tilt: float,
     few: int,
     low: float,
     high: float,
@@ -198,8 +199,8 @@ def holes(
     ----------
     pose : (3,)
         Where the joint is.
-    level : float
-        A return further than this from the line v = 0 is passed over, m.
+    level, tilt : float
+        A return further than this from the line v = 0 is passed over, m and a metre along it.
     few : int
         More beams than this must lie between two returns.
     low, high : float
@@ -217,7 +218,7 @@ def holes(
                 continue
             x, y = eye[g, 0] + rays[1, k] * r[k] - pose[0], eye[g, 1] + rays[2, k] * r[k] - pose[1]
             u, v = cos * x + sin * y, cos * y - sin * x
-            if not abs(v) < level:
+            if not abs(v) < level + tilt * abs(u):
                 continue
             middle = 0.5 * (u0 + u)
             if last >= 0 and k - last > few and low < abs(u - u0) < high and abs(middle) > beside:

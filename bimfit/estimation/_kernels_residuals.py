@@ -64,7 +64,7 @@ def residuals(
     which: int, edges: Array, pose: Array, pivot: Array, cov: Array, ranges: Array, edges_met: Ints,
     side: Ints, usable: Mask, B: Array, start: Ints, eye: Array, spacing: float, sigma: float, spread: Array,
     sensor: Array,
-) -> tuple[Array, Array, Array, Ints]:  # fmt: skip
+) -> tuple[Array, Array, Array, Array, Array, Ints]:  # fmt: skip
     """Residuals of the returns on a component, and what they say of it.
 
     Parameters
@@ -94,11 +94,12 @@ def residuals(
         range, lag 1, unexplained, edge; in the order of :class:`~bimfit.estimation.result.Residuals`; then
         excused returns, and of a face that the pose depends on without support: the edge (-1: none), its
         beams and inliers, and the direction that depends on it, in (u, v, theta * radius).
-    z, places, faces : (k,), (k, 2), (k,)
-        Residuals and places of the inliers, and the edge of each.
+    z, places, feet, lean, faces : (k,), (k, 2), (k, 2), (k,), (k,)
+        Of the inliers; see :class:`~bimfit.estimation.result.Residuals`.
     """
     n = side.shape[0]
-    out, z, places, faces = np.empty(FIGURES), np.empty(n), np.empty((n, 2)), np.empty(n, np.int64)
+    out, z, lean = np.empty(FIGURES), np.empty(n), np.empty(n)
+    places, feet, faces = np.empty((n, 2)), np.empty((n, 2)), np.empty(n, np.int64)
     rho, other, face, r = ranges[which], ranges[1 - which], edges_met[which], B[3]
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     used, stray, missed = np.empty(n, np.bool_), np.empty(n, np.bool_), np.empty(n, np.bool_)
@@ -134,7 +135,8 @@ def residuals(
                 held[e, 1] += int(inlier)
                 held[e, 2] += int(r[k] > 0.0 and not inlier)
             if inlier:
-                z[count], faces[count] = misfit * (sigma / own), e
+                z[count], lean[count], faces[count] = misfit * (sigma / own), c * (own / sigma), e
+                feet[count, 0], feet[count, 1] = x, y
                 places[count, 0] = eye[q, 0] + dx * r[k]
                 places[count, 1] = eye[q, 1] + dy * r[k]
                 count += 1
@@ -155,7 +157,7 @@ def residuals(
         for i in range(count - 1):
             lag += z[i + 1] * z[i]
         out[10] = lag / (count - 1) / max(square / count, 1e-30)
-    out[11] = _continues(rho, face, used, r, start, spacing, sigma)
+    out[11] = _continues(edges, cos, sin, rho, face, used, B, start, spacing, sigma)
     out[12] = _edge_drop(z[:count], faces[:count], edges.shape[0], sigma)
     out[13] = quiet_all
     out[14] = -1.0
@@ -164,7 +166,7 @@ def residuals(
         edges, cos, sin, pivot, rho, face, used, B, start, eye, sigma, spread, doubted, sensor[2], out[17:]
     ):
         out[14], out[15], out[16] = doubted, held[doubted, 0], held[doubted, 1]
-    return out, z[:count], places[:count], faces[:count]
+    return out, z[:count], places[:count], feet[:count], lean[:count], faces[:count]
 
 
 @jit
@@ -280,25 +282,39 @@ def _edge_drop(z: Array, faces: Ints, names: int, sigma: float) -> float:
 
 @jit
 def _continues(
-    rho: Array, face: Ints, used: Mask, r: Array, start: Ints, spacing: float, sigma: float
-) -> int:
-    """Returns that carry a surface on past where it should end: the edge is not shaped as designed."""
+    edges: Array, cos: float, sin: float, rho: Array, face: Ints, used: Mask, B: Array, start: Ints,
+    spacing: float, sigma: float,
+) -> int:  # fmt: skip
+    """Returns that carry a face on past where it should end: the edge is not shaped as designed.
+
+    From the last beam on a face that is not seen grazing, beams count that return from within four deviations
+    of the face's own line, the first that does not ends it. What lies behind the component is none of it, and
+    beams that should meet another face of it do not count.
+    """
     longest = 0
     for g in range(start.shape[0] - 1):
         s, t = start[g], start[g + 1]
         low, high = t, s - 1
         for k in range(s, t):
-            if used[k] and face[k] >= 0:
+            e = face[k]
+            if not used[k] or e < 0:
+                continue
+            nx, ny = cos * edges[e, 4] - sin * edges[e, 5], sin * edges[e, 4] + cos * edges[e, 5]
+            if nx * B[1, k] + ny * B[2, k] < -GRAZING:
                 low, high = min(low, k), k
         if high < s:
             continue
         for end in range(2):
             first, step = (low, -1) if end == 0 else (high, 1)
-            level = rho[first]
-            jump = max(4.0 * sigma, 3.0 * spacing * level)
+            e = face[first]
+            nx, ny = cos * edges[e, 4] - sin * edges[e, 5], sin * edges[e, 4] + cos * edges[e, 5]
+            level = rho[first] * (nx * B[1, first] + ny * B[2, first])
+            near = max(4.0 * sigma, spacing * rho[first])
             count, k = 0, first + step
-            while s <= k < t and used[k] and r[k] > 0.0 and abs(r[k] - level) < jump:
-                level = r[k]
-                count, k = count + 1, k + step
+            while s <= k < t and used[k] and B[3, k] > 0.0:
+                if abs(B[3, k] * (nx * B[1, k] + ny * B[2, k]) - level) > near:
+                    break
+                count += int(face[k] < 0)
+                k += step
             longest = max(longest, count)
     return longest

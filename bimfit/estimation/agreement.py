@@ -71,10 +71,11 @@ def _slopes(
     sums: dict[int, list[float]] = {}
     for station, section in zip(stations, sections, strict=True):
         c = station.components[which]
-        if c.pose is None or not len(c.residuals.places):
+        if c.pose is None or not len(c.residuals.feet):
             continue
-        faces, profile = c.residuals.faces, section.components[which]
-        along, clear, offset, _, _ = on_outline(profile, c.pose.inverse().apply(c.residuals.places), faces)
+        r = c.residuals
+        faces, offset = r.faces, r.residuals * r.lean
+        along, clear, _ = on_outline(section.components[which], c.pose.inverse().apply(r.feet), faces)
         keep = clear > _CLEAR * station.sensor.sigma
         for face in np.unique(faces[keep]).tolist():
             mine = keep & (faces == face)

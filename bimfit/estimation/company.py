@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -12,11 +13,12 @@ from bimfit.geometry.status import Status
 
 _SURE = 4.0
 """Standard deviations from which on pooled residuals are no accident."""
-_BENT = 3.5
-"""The same for a bend, which is one figure a component and not the best of many."""
+_BENT, _BOTH = 3.5, 3.6
+"""The same for a bend, one figure a component and not the best of many; and for both components' together."""
+_TAKES_PART = 2.5
 _MATTERS = 0.06
 """A shape matters where it departs from the design by this share of sigma, however sure it is."""
-_BEND_MATTERS = 0.04
+_BEND_MATTERS = 0.02
 """A bend, by this: what shows of one is what no turn of the component takes up."""
 _NEIGHBOURS, _MOSTLY = 6, 0.6
 
@@ -35,7 +37,8 @@ def with_company(
     """
     departures = [departure(stations, sections, which, correlation=correlation) for which in (0, 1)]
     sigma = min((e.sensor.sigma for e in stations), default=0.0)
-    reasons = [_reason(d) if d.rms > _least(d) * sigma else "" for d in departures]
+    together = math.hypot(*(d.bow for d in departures)) > _BOTH
+    reasons = [_reason(d, sigma, _TAKES_PART if together else _BENT) for d in departures]
     rejected = [e.status.name == "rejected" for e in stations]
     out = []
     for i, station in enumerate(stations):
@@ -62,15 +65,12 @@ def departs(found: Departure, bent: float = _SURE) -> bool:
     return found.freedom > 0 and (abs(found.bow) > bent or found.score > _SURE)
 
 
-def _least(found: Departure) -> float:
-    """Share of sigma from which on a departure matters."""
-    return _BEND_MATTERS if abs(found.bow) > _BENT else _MATTERS
-
-
-def _reason(found: Departure) -> str:
-    if not departs(found, _BENT):
+def _reason(found: Departure, sigma: float, bent: float) -> str:
+    """Why a component's shape is not as designed, "" where it is as far as matters."""
+    bends = abs(found.bow) > bent and found.bend > _BEND_MATTERS * sigma
+    if not bends and not (departs(found, math.inf) and found.rms > _MATTERS * sigma):
         return ""
-    what = "bent" if abs(found.bow) > _BENT else "of another shape"
+    what = "bent" if bends else "of another shape"
     return (
         f"pooled along the joint, its surface is {what}: up to {abs(found.worst) * 1e3:.1f} mm "
         f"{'in front of' if found.worst > 0.0 else 'behind'} the designed one"

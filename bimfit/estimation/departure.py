@@ -1,7 +1,9 @@
 """A joint's residuals pooled along it: whether its components have the designed shape (METHOD, section 5).
 
 A single slice cannot tell a bow of a few millimetres from noise; the same place on the component, seen in all
-slices of the joint, can.
+slices of the joint, can. Returns are put into bins by where their beams should have met the surface, for
+where they lie depends on their noise; and of every slice by itself what a motion of the component explains is
+taken out (least squares with a pose a station as nuisance), so that errors of its pose do not count.
 """
 
 from __future__ import annotations
@@ -26,6 +28,9 @@ _SHARE = 0.05
 """Share of the returns that a face needs to be looked at."""
 _FEWEST = 4
 _CLEAR = 2.0
+_FLAT = 1e-6
+_MOTION = 0.1
+"""Combinations of bins with less than this share of the best one's information are motions of the whole."""
 
 
 @dataclass(frozen=True)
@@ -38,13 +43,15 @@ class Departure:
         Middles of the bins, on the designed component, m.
     offset, sd : ndarray, shape (k,)
         Mean distance of the returns in front of the designed surface (outward positive), what a rigid
-        motion explains taken out, and its standard deviation, m.
+        motion of each station explains taken out, and its standard deviation, m.
     chi2 : float
-        Sum of (offset / sd)^2, a degree of freedom; NaN without bins.
+        Of all offsets, a degree of freedom; NaN without bins.
     freedom : int
         Bins less what a rigid motion takes.
     bow : float
         How many standard deviations a parabola along the outline is away from none.
+    bend : float
+        Root mean square of that parabola, what a rigid motion explains taken out, m.
     """
 
     places: Array
@@ -53,6 +60,7 @@ class Departure:
     chi2: float
     freedom: int
     bow: float
+    bend: float
 
     @property
     def worst(self) -> float:
@@ -75,7 +83,7 @@ class Departure:
         return (math.cbrt(self.chi2) - (1.0 - k)) / math.sqrt(k)
 
 
-NOTHING = Departure(np.zeros((0, 2)), np.zeros(0), np.zeros(0), math.nan, 0, 0.0)
+NOTHING = Departure(np.zeros((0, 2)), np.zeros(0), np.zeros(0), math.nan, 0, 0.0, 0.0)
 
 
 def departure(
@@ -97,25 +105,71 @@ def departure(
     bins : int
         Of equal count along the component's outline.
     """
-    parts = []
-    for station, section in zip(stations, sections, strict=True):
-        c = station.components[which]
-        if c.pose is None or len(c.residuals.places) < _LEAST:
-            continue
-        faces = c.residuals.faces
-        along, clear, *at = on_outline(
-            section.components[which], c.pose.inverse().apply(c.residuals.places), faces
-        )
-        # near an edge, a beam that meets the other face is taken for one of this
-        keep = clear > _CLEAR * station.sensor.sigma
-        parts.append((faces[keep], along[keep], *(column[keep] for column in at)))
-    if not parts:
+    parts = [
+        _Returns.of(station, section.components[which], which, k)
+        for k, (station, section) in enumerate(zip(stations, sections, strict=True))
+    ]
+    pooled = _Returns.joined([part for part in parts if part is not None])
+    if pooled is None:
         return NOTHING
-    faces, along, offset, places, normals = (np.concatenate(column) for column in zip(*parts, strict=True))
-    groups = _groups(faces, along, bins)
+    groups = _groups(pooled.faces, pooled.along, bins)
     if len(groups) < _FEWEST:
         return NOTHING
-    return _binned(groups, along, offset, places, normals, correlation)
+    return _binned(pooled, groups, correlation)
+
+
+@dataclass(frozen=True)
+class _Returns:
+    """Returns of one component, a row each.
+
+    Attributes
+    ----------
+    station, faces : ndarray, shape (n,)
+        Which station, and which edge of the profile.
+    along : ndarray, shape (n,)
+        Of the beam's foot, along the outline, m.
+    feet, normals : ndarray, shape (n, 2)
+        On the designed component.
+    z, lean : ndarray, shape (n,)
+        See :class:`~bimfit.estimation.result.Residuals`.
+    """
+
+    station: Ints
+    faces: Ints
+    along: Array
+    feet: Array
+    normals: Array
+    z: Array
+    lean: Array
+
+    @classmethod
+    def of(cls, station: StationEstimate, profile: Profile, which: int, k: int) -> _Returns | None:
+        """Those of one station that belong to their face for certain; None where there are hardly any."""
+        c = station.components[which]
+        r = c.residuals
+        if c.pose is None or len(r.feet) < _LEAST:
+            return None
+        feet = c.pose.inverse().apply(r.feet)
+        along, clear, normals = on_outline(profile, feet, r.faces)
+        # near an edge, a beam that meets the other face is taken for one of this
+        keep = clear > _CLEAR * station.sensor.sigma
+        every = cls(np.full(len(along), k), r.faces, along, feet, normals, r.residuals, r.lean)
+        return every.take(keep)
+
+    def take(self, rows: Ints | NDArray[np.bool_]) -> _Returns:
+        """Some of them."""
+        return _Returns(
+            self.station[rows], self.faces[rows], self.along[rows], self.feet[rows], self.normals[rows],
+            self.z[rows], self.lean[rows],
+        )  # fmt: skip
+
+    @classmethod
+    def joined(cls, parts: Sequence[_Returns]) -> _Returns | None:
+        """All in one; None where there are none."""
+        if not parts:
+            return None
+        rows = [(p.station, p.faces, p.along, p.feet, p.normals, p.z, p.lean) for p in parts]
+        return cls(*(np.concatenate(column) for column in zip(*rows, strict=True)))
 
 
 def _groups(faces: Ints, along: Array, bins: int) -> list[Ints]:
@@ -131,58 +185,75 @@ def _groups(faces: Ints, along: Array, bins: int) -> list[Ints]:
     return out
 
 
-def on_outline(profile: Profile, points: Array, faces: Ints) -> tuple[Array, Array, Array, Array, Array]:
+def on_outline(profile: Profile, feet: Array, faces: Ints) -> tuple[Array, Array, Array]:
     """Where on a profile's outline points lie that are known to belong to certain edges.
 
     Parameters
     ----------
-    points : ndarray, shape (m, 2)
+    feet : ndarray, shape (m, 2)
         On the designed component.
     faces : ndarray, shape (m,)
         The edge of each.
 
     Returns
     -------
-    along, clear, offset : ndarray, shape (m,)
-        Distance along the outline, from the nearer end of the edge, and in front of its surface (outward
-        positive), m.
-    places, normals : ndarray, shape (m, 2)
-        The foot of each point on its edge, and the outward normal there.
+    along, clear : ndarray, shape (m,)
+        Distance along the outline, and from the nearer end of the edge, m.
+    normals : ndarray, shape (m, 2)
+        The outward normal there.
     """
     edges = profile.edges
     d = edges[:, 1] - edges[:, 0]
     size = np.maximum(np.linalg.norm(d, axis=1), 1e-12)
     start = np.concatenate([[0.0], np.cumsum(size)])
-    a, d, normal = edges[faces, 0], d[faces] / size[faces, None], profile.normals[faces]
-    w = points - a
-    t = (w * d).sum(axis=1)
-    clear = np.minimum(t, size[faces] - t)
-    return start[faces] + t, clear, np.asarray((w * normal).sum(axis=1)), a + t[:, None] * d, normal
+    t = ((feet - edges[faces, 0]) * d[faces] / size[faces, None]).sum(axis=1)
+    return start[faces] + t, np.minimum(t, size[faces] - t), np.asarray(profile.normals[faces])
 
 
-def _binned(
-    groups: Sequence[Ints], along: Array, offset: Array, places: Array, normals: Array, correlation: float
-) -> Departure:
-    """Means in bins, less the rigid motion that explains most of them."""
-    mean = np.array([offset[g].mean() for g in groups])
-    total = sum(len(g) for g in groups)
-    within = sum(float(((offset[g] - m) ** 2).sum()) for g, m in zip(groups, mean, strict=True))
-    sigma = math.sqrt(within / max(total - len(groups), 1) * (1.0 + correlation) / (1.0 - correlation))
-    sd = np.array([sigma / math.sqrt(len(g)) for g in groups])
-    middle = np.array([places[g].mean(axis=0) for g in groups])
-    normal = np.array([normals[g].mean(axis=0) for g in groups])
-    arm = middle - middle.mean(axis=0)
-    scale = max(float(np.abs(arm).max()), 1e-6)
-    turn = (arm[:, 0] * normal[:, 1] - arm[:, 1] * normal[:, 0]) / scale
-    left, singular, _ = np.linalg.svd(np.column_stack([normal, turn]) / sd[:, None], full_matrices=False)
-    left = left[:, singular > 1e-3 * singular[0]]
-    z = mean / sd
-    z = z - left @ (left.T @ z)
-    where = np.array([along[g].mean() for g in groups])
-    bend = ((where - where.mean()) / max(float(np.ptp(where)), 1e-9)) ** 2 / sd
-    bend = bend - left @ (left.T @ bend)
-    size = float(np.linalg.norm(bend))
-    bow = float(bend @ z) / size if size > 1e-9 else 0.0
-    freedom = len(groups) - left.shape[1]
-    chi2 = float(z @ z) / freedom if freedom > 0 else math.nan
-    return Departure(middle, z * sd, sd, chi2, freedom, bow)
+def _binned(rows: _Returns, groups: Sequence[Ints], correlation: float) -> Departure:
+    """Least squares of one offset a bin, with a motion a station as nuisance parameters."""
+    group = np.repeat(np.arange(len(groups)), [len(g) for g in groups])
+    rows = rows.take(np.concatenate(groups))
+    _, station = np.unique(rows.station, return_inverse=True)
+    z, lean, k, n = rows.z, rows.lean, len(groups), int(station.max()) + 1
+    moves = _moves(rows)
+    # sums a station, and a station and bin
+    cell = station * k + group
+    gram = np.stack([[np.bincount(station, a * b, n) for a in moves.T] for b in moves.T]).transpose(2, 0, 1)
+    seen = np.stack([np.bincount(station, a * z, n) for a in moves.T], axis=1)
+    cross = np.stack([np.bincount(cell, a / lean, n * k).reshape(n, k) for a in moves.T], axis=2)
+    inverse = np.linalg.pinv(gram, rcond=_FLAT, hermitian=True)
+    taken = cross @ inverse
+    information = np.diag(np.bincount(group, 1.0 / lean**2, k)) - np.einsum("ska,sla->kl", taken, cross)
+    pull = np.bincount(group, z / lean, k) - np.einsum("ska,sa->k", taken, seen)
+    size, vectors = np.linalg.eigh(information)
+    free = size > _MOTION * size[-1]
+    size, vectors = size[free], vectors[:, free]
+    offset = vectors @ (vectors.T @ pull / size)
+    explained = float(((vectors.T @ pull) ** 2 / size).sum())
+    left = float(z @ z) - float(np.einsum("sa,sab,sb->", seen, inverse, seen)) - explained
+    freedom = len(size)
+    spent = int(np.linalg.matrix_rank(gram, rtol=_FLAT, hermitian=True).sum()) + freedom
+    sigma2 = left / max(len(z) - spent, 1) * (1.0 + correlation) / (1.0 - correlation)
+    sd = np.sqrt(sigma2 * (vectors**2 / size).sum(axis=1))
+    count = np.bincount(group, minlength=k)
+    where = np.bincount(group, rows.along, k) / count
+    bend = ((where - where.mean()) / max(float(np.ptp(where)), 1e-9)) ** 2
+    weight = float(bend @ information @ bend)
+    known = weight > _FLAT * size[-1]
+    rise = float(bend @ pull) / weight if known else 0.0
+    shown = vectors @ (vectors.T @ bend)
+    middle = np.stack([np.bincount(group, x, k) / count for x in rows.feet.T], axis=1)
+    chi2 = explained / sigma2 / freedom if freedom > 0 else math.nan
+    return Departure(
+        middle, offset, sd, chi2, freedom, rise * math.sqrt(weight / sigma2),
+        abs(rise) * float(np.sqrt(np.mean(shown**2))),
+    )  # fmt: skip
+
+
+def _moves(rows: _Returns) -> Array:
+    """What residual a unit of each motion of the component makes, shape (n, 3)."""
+    arm = rows.feet - rows.feet.mean(axis=0)
+    turn = arm[:, 0] * rows.normals[:, 1] - arm[:, 1] * rows.normals[:, 0]
+    moves = np.column_stack([rows.normals, turn / max(float(np.abs(arm).max()), 1e-6)])
+    return np.asarray(moves / rows.lean[:, None])

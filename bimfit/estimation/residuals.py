@@ -47,7 +47,7 @@ def residuals_of(
         Greatest standard deviation of a direction that counts as fixed, m.
     """
     lost = min(max(sensor.miss_share + sensor.outlier_share, 0.01), 0.9)
-    f, z, places, faces = kernels.residuals(
+    f, z, places, feet, lean, faces = kernels.residuals(
         which, rows, posterior.pose.as_array(), posterior.pivot, posterior.pivot_covariance, views.ranges,
         views.faces, sight.side, sight.usable, table.rows, table.start, table.eye, table.spacing,
         sensor.sigma, _ALIKE if spread is None else spread, np.array([lost, sensor.outlier_run, fixed]),
@@ -57,7 +57,7 @@ def residuals_of(
     rms, chi2, strays, misses, stray_run, miss_run, cusum, lag1, unexplained, edge = figures[3:13]
     return Residuals(
         n_beams, n_covered, n_inliers, rms, chi2, strays, misses, int(stray_run), int(miss_run), cusum, lag1,
-        int(unexplained), edge, z, places, faces,
+        int(unexplained), edge, z, places, feet, lean, faces,
         _unsupported(f),
     )  # fmt: skip
 

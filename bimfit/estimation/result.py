@@ -59,6 +59,10 @@ class Residuals:
         How far the last returns at an end of the main face lie behind it, in standard deviations.
     residuals, places : ndarray, shape (n_inliers,) and (n_inliers, 2)
         Residuals in range, m, and where the returns lie in the section.
+    feet : ndarray, shape (n_inliers, 2)
+        Where the beams should have met the component.
+    lean : ndarray, shape (n_inliers,)
+        How far in front of the surface (negative: behind) a residual of one metre lies.
     faces : ndarray, shape (n_inliers,)
         The edge of the component's profile that each should have met.
     unsupported : Unsupported or None
@@ -80,6 +84,8 @@ class Residuals:
     edge: float = 0.0
     residuals: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     places: Array = field(default_factory=lambda: np.zeros((0, 2)), repr=False)
+    feet: Array = field(default_factory=lambda: np.zeros((0, 2)), repr=False)
+    lean: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     faces: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64), repr=False)
     unsupported: Unsupported | None = None
 

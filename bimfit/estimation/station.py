@@ -93,7 +93,7 @@ def _estimated(
     for place in gap_places(section, context.beams, best.combined):
         there = best_start(section, context.table, (place,), context.sensor, fit)
         others.append(_with_inside(context, components_at(context, there, (None, None))))
-    return with_lookalikes(best, others, fit.joint_sigma)
+    return with_lookalikes(best, others, section.gap.width, fit.joint_sigma)
 
 
 def _with_inside(context: Context, station: StationEstimate) -> StationEstimate:
