@@ -80,7 +80,7 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {
 
 def choosing(command: Callable[..., int]) -> Callable[..., int]:
     """Give a command the options that choose joints, as one argument ``choice`` (a Selection)."""
-    return shared_options(command, "choice", _OPTIONS, selection)
+    return shared_options(command, "choice", _OPTIONS, selection, "Which joints")
 
 
 def selection(

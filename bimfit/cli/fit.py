@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from bimfit.cli.choosing import choosing
+from bimfit.cli.help import METHOD, SLICES, WRITTEN
 from bimfit.cli.limits import HELP as LIMITS_HELP
 from bimfit.cli.limits import read_limits
 from bimfit.cli.options import MISSING_HELP, build_config
@@ -36,51 +37,87 @@ def run(
     ),
     output: Path = typer.Option(..., "-o", "--output", metavar="DIR", help="Where the results go."),
     method: str = typer.Option(
-        "grcsm", "--method", metavar="M", help="The matcher: grcsm, block, mrcsm, icp-point, ..."
+        "grcsm",
+        "--method",
+        rich_help_panel=METHOD,
+        metavar="M",
+        help="The matcher: grcsm, block, mrcsm, icp-point, ...",
     ),
     motion: str = typer.Option(
         "auto",
         "--motion",
+        rich_help_panel=METHOD,
         help="Motion along the joint: auto, independent, const, rigid, linear, smooth, kinked.",
     ),
     paper: bool = typer.Option(
         False,
         "--paper",
+        rich_help_panel=METHOD,
         help="The method as printed: whole outlines, block tables, grid answers, no smoothing.",
     ),
     window: str | None = typer.Option(
-        None, "--window", metavar="U,V,THETA", help="Half widths, such as 121.5mm,121.5mm,45deg."
+        None,
+        "--window",
+        rich_help_panel=METHOD,
+        metavar="U,V,THETA",
+        help="Half widths, such as 121.5mm,121.5mm,45deg.",
     ),
     tolerance: str | None = typer.Option(
-        None, "--tolerance", metavar="U,V,THETA", help="Such as 1mm,1mm,0.6deg."
+        None, "--tolerance", rich_help_panel=METHOD, metavar="U,V,THETA", help="Such as 1mm,1mm,0.6deg."
     ),
-    spacing: str | None = typer.Option(None, "--spacing", help="Distance between stations, such as 10mm."),
+    spacing: str | None = typer.Option(
+        None, "--spacing", rich_help_panel=SLICES, help="Distance between stations, such as 10mm."
+    ),
     thickness: str | None = typer.Option(
-        None, "--thickness", help="Thickness of a cloud's slices, such as 10mm."
+        None, "--thickness", rich_help_panel=SLICES, help="Thickness of a cloud's slices, such as 10mm."
     ),
-    sigma: str | None = typer.Option(None, "--sigma", help="The sensor's range noise, such as 3mm."),
-    missing: str | None = typer.Option(None, "--missing", metavar="gap|unknown", help=MISSING_HELP),
+    sigma: str | None = typer.Option(
+        None, "--sigma", rich_help_panel=SLICES, help="The sensor's range noise, such as 3mm."
+    ),
+    missing: str | None = typer.Option(
+        None, "--missing", rich_help_panel=SLICES, metavar="gap|unknown", help=MISSING_HELP
+    ),
     shape: str | None = typer.Option(
         None,
         "--shape",
+        rich_help_panel=METHOD,
         metavar="FREEDOMS",
         help="Free the components' shapes, with priors: bevel-angle=2deg,face-angle=1deg,thickness=1mm.",
     ),
     profile: Path | None = typer.Option(
-        None, "--profile", metavar="FILE", help="A profile that bimfit teach wrote, in place of the design."
+        None,
+        "--profile",
+        rich_help_panel=METHOD,
+        metavar="FILE",
+        help="A profile that bimfit teach wrote, in place of the design.",
     ),
-    config: Path | None = typer.Option(None, "--config", metavar="FILE.toml", help="Settings."),
-    pictures: bool = typer.Option(True, help="Draw pictures."),
-    report: bool = typer.Option(True, help="Write report.html."),
-    as_built: bool = typer.Option(True, help="Write the model with the gaps as as-built.ifc."),
+    config: Path | None = typer.Option(
+        None, "--config", rich_help_panel=METHOD, metavar="FILE.toml", help="Settings."
+    ),
+    pictures: bool = typer.Option(True, help="Draw pictures.", rich_help_panel=WRITTEN),
+    report: bool = typer.Option(True, help="Write report.html.", rich_help_panel=WRITTEN),
+    as_built: bool = typer.Option(
+        True, help="Write the model with the gaps as as-built.ifc.", rich_help_panel=WRITTEN
+    ),
     move_elements: bool = typer.Option(
-        False, "--move-elements", help="In as-built.ifc, put components where they are."
+        False,
+        "--move-elements",
+        rich_help_panel=WRITTEN,
+        help="In as-built.ifc, put components where they are.",
     ),
-    limits: str | None = typer.Option(None, "--limits", metavar="LIMITS", help=LIMITS_HELP),
+    limits: str | None = typer.Option(
+        None, "--limits", rich_help_panel=WRITTEN, metavar="LIMITS", help=LIMITS_HELP
+    ),
     bcf: Path | None = typer.Option(
-        None, "--bcf", metavar="FILE", help="Write joints that break the limits or were not measured there."
+        None,
+        "--bcf",
+        rich_help_panel=WRITTEN,
+        metavar="FILE",
+        help="Write joints that break the limits or were not measured there.",
     ),
-    bcf_version: str = typer.Option("2.1", "--bcf-version", metavar="V", help="2.1 or 3.0."),
+    bcf_version: str = typer.Option(
+        "2.1", "--bcf-version", rich_help_panel=WRITTEN, metavar="V", help="2.1 or 3.0."
+    ),
 ) -> int:
     """Fit the joints of a model to a scan and write the as-built gap."""
     from bimfit.pipeline.deliver import Deliverables, check_deliverables, deliver

@@ -26,6 +26,7 @@ from bimfit.cli import (
     teach,
     view,
 )
+from bimfit.cli.help import GroupedCommand
 from bimfit.errors import BimfitError
 from bimfit.sensor.exits import termination_raises
 
@@ -41,19 +42,19 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command("demo")(demo.run)
-app.command("joints")(joints.run)
-app.command("fit")(fit.run)
-app.command("compare")(compare.run)
-app.command("simulate")(simulate.run)
-app.command("convert")(convert.run)
-app.command("capture")(capture.run)
-app.command("emulate")(emulate.run)
-app.command("live")(live.run)
-app.command("view")(view.run)
-app.command("report")(report.run)
-app.command("teach")(teach.run)
-app.command("bench")(bench.run)
+app.command("demo", cls=GroupedCommand)(demo.run)
+app.command("joints", cls=GroupedCommand)(joints.run)
+app.command("fit", cls=GroupedCommand)(fit.run)
+app.command("compare", cls=GroupedCommand)(compare.run)
+app.command("simulate", cls=GroupedCommand)(simulate.run)
+app.command("convert", cls=GroupedCommand)(convert.run)
+app.command("capture", cls=GroupedCommand)(capture.run)
+app.command("emulate", cls=GroupedCommand)(emulate.run)
+app.command("live", cls=GroupedCommand)(live.run)
+app.command("view", cls=GroupedCommand)(view.run)
+app.command("report", cls=GroupedCommand)(report.run)
+app.command("teach", cls=GroupedCommand)(teach.run)
+app.command("bench", cls=GroupedCommand)(bench.run)
 
 
 def _show_version(wanted: bool) -> None:

@@ -64,7 +64,7 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {
 
 def placing(command: Callable[..., int]) -> Callable[..., int]:
     """Give a command the options that place a scan, as one argument ``where`` (a Placing)."""
-    return shared_options(command, "where", _OPTIONS, _placing)
+    return shared_options(command, "where", _OPTIONS, _placing, "Where the scan lies")
 
 
 def _placing(

@@ -14,21 +14,36 @@ from bimfit.errors import ConfigError
 if TYPE_CHECKING:
     from bimfit.scan.formats.options import ReadOptions
 
+HEADING = "How the scan is read"
 READING: dict[str, tuple[Any, Any]] = {
     "scan_unit": (
         str | None,
         typer.Option(
-            None, "--scan-unit", metavar="UNIT", help="Unit of its lengths: m, mm, cm, ft, usft or in."
+            None,
+            "--scan-unit",
+            metavar="UNIT",
+            help="Unit of its lengths: m, mm, cm, ft, usft or in.",
+            rich_help_panel=HEADING,
         ),
     ),
     "topic": (
         str,
-        typer.Option("", "--topic", metavar="NAME", help="Which topic of a ROS bag, where it has several."),
+        typer.Option(
+            "",
+            "--topic",
+            metavar="NAME",
+            rich_help_panel=HEADING,
+            help="Which topic of a ROS bag, where it has several.",
+        ),
     ),
     "frame": (
         str,
         typer.Option(
-            "", "--frame", metavar="NAME", help="In which frame of a ROS bag; default: the one above all."
+            "",
+            "--frame",
+            metavar="NAME",
+            rich_help_panel=HEADING,
+            help="In which frame of a ROS bag; default: the one above all.",
         ),
     ),
     "pixel": (
@@ -36,6 +51,7 @@ READING: dict[str, tuple[Any, Any]] = {
         typer.Option(
             None,
             "--pixel",
+            rich_help_panel=HEADING,
             metavar="ACROSS,ALONG[,UP]",
             help="Of height maps and profile tables: distance between columns and between rows, and height "
             "of a count, such as 0.1mm,0.1mm,0.005mm.",

@@ -13,6 +13,7 @@ def shared_options(
     argument: str,
     options: Mapping[str, tuple[Any, Any]],
     gather: Callable[..., Any],
+    heading: str = "",
 ) -> Callable[..., int]:
     """Give a command more options, which it receives as one argument.
 
@@ -25,7 +26,11 @@ def shared_options(
         By parameter name.
     gather : callable
         Makes the argument of the options' values, given by name.
+    heading : str
+        What the options without one stand under on a help page.
     """
+    for _, option in options.values():
+        option.rich_help_panel = option.rich_help_panel or heading or None
     own = inspect.signature(command)
     # a command that already shares options has types for annotations, a plain one has strings; the shared
     # arguments' own types are only there for the type checker

@@ -5,11 +5,13 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 
 import pytest
+import typer
 
 from bimfit.cli.choosing import length_range
-from bimfit.cli.main import main
+from bimfit.cli.main import app, main
 from bimfit.errors import ConfigError
 
 
@@ -72,3 +74,22 @@ def test_a_choice_that_cannot_be_is_one_line(command, samples, tmp_path, capsys)
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert "Storey 1, Storey 2, Storey 3" in line
     assert not (tmp_path / "o").exists() and not (tmp_path / "o.csv").exists()
+
+
+def test_help_lists_every_option_once_and_under_its_heading(capsys):
+    assert main(["fit", "--help"]) == 0
+    page = capsys.readouterr().out
+    named = re.findall(r"^  (?:-\w, )?(--[\w-]+)", page, flags=re.MULTILINE)
+    command = typer.main.get_command(app).commands["fit"]
+    options = [param for param in command.params if param.param_type_name == "option"]
+    known = [next(name for name in param.opts if name.startswith("--")) for param in options]
+    assert sorted(named) == sorted([*known, "--help"])
+    heading = dict.fromkeys(("--method", "--sigma", "--bcf", "--scan-crs", "--scan-unit", "--storey"), "")
+    for block in page.split("\n\n"):
+        for option in heading:
+            if f"  {option} " in block:
+                heading[option] = block.splitlines()[0]
+    assert list(heading.values()) == [
+        "Method:", "Slices and sensor:", "What is written:", "Where the scan lies:", "How the scan is read:",
+        "Which joints:",
+    ]  # fmt: skip
