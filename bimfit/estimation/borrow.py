@@ -35,6 +35,15 @@ def at_corner(pose: Pose2D, corner: Array) -> Array:
     return np.array([[1.0, 0.0, -arm[1]], [0.0, 1.0, arm[0]], [0.0, 0.0, 1.0]])
 
 
+def at_corners(gradients: Array, poses: Sequence[Pose2D | None], corner: Array) -> Array:
+    """Gradients (n, 3) by (u, v, theta) of the corner's motion, of those by the poses'; 0 without a pose."""
+    rows = np.zeros((len(gradients), 3))
+    for i, pose in enumerate(poses):
+        if pose is not None:
+            rows[i] = np.linalg.solve(at_corner(pose, corner[i]).T, gradients[i])
+    return rows
+
+
 def borrow(
     stations: Sequence[StationEstimate],
     sections: Sequence[JointSection],

@@ -12,7 +12,8 @@ import numpy as np
 from bimfit.errors import ConfigError
 from bimfit.estimation import _kernels_knots as kernels
 from bimfit.estimation import trend
-from bimfit.estimation.borrow import FLAG, SHAKES, at_corner, borrow
+from bimfit.estimation.borrow import FLAG, SHAKES, at_corner, at_corners, borrow
+from bimfit.estimation.cells import SharedCells, shared_cells, with_shared_cells
 from bimfit.estimation.disagreement import disagreements
 from bimfit.estimation.pooled import pooled
 from bimfit.estimation.result import ComponentEstimate, StationEstimate
@@ -52,12 +53,12 @@ class Coupling:
 
         Zero where there is no pose.
         """
-        rows = np.zeros((len(gradients), 3))
-        for i, pose in enumerate(poses):
-            if pose is not None:
-                rows[i] = np.linalg.solve(at_corner(pose, self.corner[i]).T, gradients[i])
+        rows = at_corners(gradients, poses, self.corner)
         H = (self.basis.functions[:, :, None] * rows[:, None, :])[:, self.basis.moves]
         return np.asarray(H @ self.spread @ H.T)
+
+
+Couplings = tuple[Coupling | SharedCells, Coupling | SharedCells]
 
 
 @dataclass(frozen=True)
@@ -76,8 +77,8 @@ class JointEstimate:
         Stations' distances along the joint at which the ``kinked`` model bends, m.
     outliers : tuple of (int, str)
         Stations that disagree with their neighbours, and which component does.
-    couplings : tuple of two Coupling, or None
-        Of A and B; None where every station stands for itself.
+    couplings : tuple of two Coupling or SharedCells, or None
+        Of A and B; None where too few stations are known.
     """
 
     stations: tuple[StationEstimate, ...]
@@ -85,7 +86,7 @@ class JointEstimate:
     criterion: dict[str, float] = field(default_factory=dict)
     knots: Array = field(default_factory=lambda: np.zeros(0))
     outliers: tuple[tuple[int, str], ...] = ()
-    couplings: tuple[Coupling, Coupling] | None = None
+    couplings: Couplings | None = None
 
 
 def estimate_joint(
@@ -118,10 +119,15 @@ def estimate_joint(
         raise ConfigError(f"unknown motion model {model}", remedy="one of " + ", ".join(get_args(Motion)))
     stations = tuple(estimates)
     parts = (_sites(stations, sections, 0), _sites(stations, sections, 1))
-    if model == "independent" or min(int(p.known.sum()) for p in parts) < _FEW:
+    if min(int(p.known.sum()) for p in parts) < _FEW:
         return JointEstimate(stations, "independent")
-    if model == "auto" and not _mostly_sound(stations):
-        return JointEstimate(stations, "independent")
+    corners = [np.array([section.gap.mouth[which] for section in sections]) for which in (0, 1)]
+    if model == "independent" or (model == "auto" and not _mostly_sound(stations)):
+        still = _bases("smooth", parts, np.zeros(0))
+        a, b = (
+            shared_cells(*every) for every in zip(parts, still, _fit_pair(parts, still), corners, strict=True)
+        )
+        return JointEstimate(stations, "independent", couplings=(a, b))
     fits: dict[str, tuple[Trend, Trend]] = {}
     bases: dict[str, tuple[Basis, Basis]] = {}
     criterion: dict[str, float] = {}
@@ -142,11 +148,8 @@ def estimate_joint(
     bent = knots if chosen == "kinked" else np.zeros(0)
     apart = disagreements(stations, sections, parts, fitted, bent)
     out, outliers = _apply(stations, sections, parts, apart)
-    couplings = tuple(
-        Coupling(b, t.spread, np.array([section.gap.mouth[which] for section in sections]))
-        for which, (b, t) in enumerate(zip(final, fitted, strict=True))
-    )
-    return JointEstimate(out, chosen, criterion, bent, outliers, (couplings[0], couplings[1]))
+    one, two = (Coupling(b, t.spread, c) for b, t, c in zip(final, fitted, corners, strict=True))
+    return JointEstimate(out, chosen, criterion, bent, outliers, (one, two))
 
 
 def _refined(
@@ -167,7 +170,7 @@ def _refined(
     used: list[Basis] = []
     for which, sites in enumerate(parts):
         basis = bases[name][which]
-        rough = trend.with_shared_cells(sites, basis, fits[name][which])
+        rough = with_shared_cells(sites, basis, fits[name][which])
         better = None
         if name in _FEW_PARAMETERS:
             bowed, start = trend.bowed(basis, rough, fits[name])

@@ -21,10 +21,6 @@ NODES = 150
 _NU = 4.0
 _JUMP = np.array([0.004, 0.004, 0.035])
 """What a station that jumps is off by, standard deviations in u, v (m) and theta (rad)."""
-_LEAST = 0.75
-"""Cells shared by stations never make a variance less than this share of what it is without."""
-_HARMONICS = 8
-_SOME = 0.05
 _OWN, _STRAIGHT = 0.003, 2e-6
 _JUMPS = 0.01
 """Share of stations that jump."""
@@ -213,7 +209,7 @@ def solve(sites: Sites, basis: Basis, weight: Array) -> tuple[Array, Array]:
     return beta.reshape(k, 3), np.asarray(cov)
 
 
-def _blocks(M: Array, basis: Basis) -> Array:
+def at_stations(M: Array, basis: Basis) -> Array:
     """X_i M X_i^T of every station, shape (n, 3, 3), for M (free, free)."""
     k = basis.functions.shape[1]
     free = basis.moves.ravel()
@@ -236,14 +232,14 @@ def fit(sites: Sites, basis: Basis, *, rounds: int = 4) -> Trend:
     weight = np.ones(n)
     for _ in range(rounds):
         beta, cov = solve(sites, basis, weight)
-        distance, _ = _left_out(sites, weight, basis.functions @ beta, _blocks(cov, basis))
+        distance, _ = _left_out(sites, weight, basis.functions @ beta, at_stations(cov, basis))
         new = np.minimum((_NU + 3.0) / (_NU + distance), 1.0)
         done = float(np.abs(new - weight).max()) < 0.01
         weight = new
         if done:
             break
     beta, cov = solve(sites, basis, weight)
-    value, V = basis.functions @ beta, _blocks(cov, basis)
+    value, V = basis.functions @ beta, at_stations(cov, basis)
     e = sites.value - value
     q = np.einsum("ia,iab,ib->i", e, sites.precision, e)
     known = sites.known
@@ -277,67 +273,6 @@ def _left_out(sites: Sites, weight: Array, value: Array, V: Array) -> tuple[Arra
     odds = np.clip(odds + np.log(_JUMPS / (1.0 - _JUMPS)), -50.0, 50.0)
     known = sites.known
     return np.where(known, np.maximum(near, 0.0), 0.0), np.where(known, 1.0 / (1.0 + np.exp(-odds)), 0.0)
-
-
-def with_shared_cells(sites: Sites, basis: Basis, trend: Trend) -> Trend:
-    """The trend with what stations have in common because they see a corner between beams.
-
-    A station puts a corner in the middle of the cell between two beams: its error is a sawtooth of the
-    corner's bearing. With no drift it is one and the same, and averaging does not help across the gap; with
-    drift, stations err in opposite ways as often as in the same; V = V0 + K E K^T (METHOD, section 5).
-    """
-    k = np.flatnonzero(sites.known & np.isfinite(sites.step) & (sites.share > _SOME))
-    if len(k) < 2:
-        return trend
-    s = np.sqrt(sites.share[k] / np.maximum(sites.precision[k, 0, 0], 1e-6))
-    R = np.einsum("ik,a->kai", basis.functions[k], np.eye(3)[0]).reshape(-1, len(k))[basis.moves.ravel()]
-    rho = cell_correlation(
-        s / sites.share[k], sites.step[k], (trend.value - sites.value)[k, 0], R.T @ trend.spread @ R
-    )
-    np.fill_diagonal(rho, 0.0)
-    pull = sites.precision[k, :, 0] * trend.weight[k, None]
-    R = np.einsum("ik,ia->kai", basis.functions[k], pull).reshape(-1, len(k))
-    G = trend.spread @ R[basis.moves.ravel()]
-    # corners seen at different places between two beams err in opposite ways: the sum may well be less
-    variances, root = np.linalg.eigh(trend.spread)
-    kept = variances > 1e-13 * variances[-1]
-    root = root[:, kept] * np.sqrt(variances[kept])
-    back = root.T / variances[kept, None]
-    half = back @ (G * s)
-    values, axes = np.linalg.eigh(half @ rho @ half.T)
-    wide = root @ axes
-    shared = (wide * np.maximum(values, _LEAST - 1.0)) @ wide.T
-    return replace(trend, covariance=trend.covariance + _blocks(shared, basis), spread=trend.spread + shared)
-
-
-def cell_correlation(sd: Array, step: Array, off: Array, spread: Array) -> Array:
-    """Correlation (n, n) of the errors that the cells between beams make at n stations.
-
-    For two corners d steps of the beams apart it is 1 - 6 f (1 - f), f the fraction of d. That is a sum of
-    cosines, 6 / (pi k)^2 cos(2 pi k d), and each fades as exp(-2 (pi k)^2 var d) where d is uncertain: all
-    terms are positive definite, and so is the sum.
-
-    Parameters
-    ----------
-    sd : ndarray, shape (n,)
-        Of each station across the gap: that of an even spread over its cell, m.
-    step : ndarray, shape (n,)
-        Bearing of each corner as its station puts it, in beam steps.
-    off : ndarray, shape (n,)
-        How far from there, across the gap, it really is, as far as is known, m.
-    spread : ndarray, shape (n, n)
-        Covariance of where the corners are, m^2.
-    """
-    pitch = np.sqrt(12.0) * np.median(sd)
-    at = step + off / pitch
-    d = at[:, None] - at[None, :]
-    own = np.diag(spread)
-    variance = (own[:, None] + own[None, :] - 2.0 * spread) / pitch**2
-    out: Array = np.zeros_like(d)
-    for k in range(1, _HARMONICS + 1):
-        wave = np.pi * k
-        out += 6.0 / wave**2 * np.cos(2.0 * wave * d) * np.exp(-2.0 * wave**2 * np.maximum(variance, 0.0))
-    return out
 
 
 class Evidence:

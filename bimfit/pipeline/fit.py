@@ -173,7 +173,7 @@ def fit_along(joint: Joint, fitted: SliceFits, motion: str = "auto") -> JointRes
     """The joint as a whole: motion along it, its gap, mesh and volumes (METHOD, sections 5 and 6)."""
     begin = time.perf_counter()
     fits, couplings = list(fitted.stations), None
-    if fitted.method == "grcsm" and motion != "independent" and fits:
+    if fitted.method == "grcsm" and fits:
         whole = estimate_joint([f.estimate for f in fits if f.estimate], [f.section for f in fits], motion)
         fits = [dataclasses.replace(f, estimate=e) for f, e in zip(fits, whole.stations, strict=True)]
         motion, couplings = whole.model, whole.couplings

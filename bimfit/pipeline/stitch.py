@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bimfit.estimation.motion import Coupling
+from bimfit.estimation.motion import Couplings
 from bimfit.gap.mesh import GapMesh, loft
 from bimfit.gap.section import area_gradient
 from bimfit.gap.volume import Volumes, gap_volumes
@@ -36,7 +36,7 @@ def stitch(
     )
 
 
-def area_correlation(stations: Sequence[StationResult], couplings: tuple[Coupling, Coupling]) -> Array:
+def area_correlation(stations: Sequence[StationResult], couplings: Couplings) -> Array:
     """Correlation (n, n) of the errors of the stations' areas, from a model of the motion along the joint.
 
     What one station is surer or less sure of than the model is its own and does not correlate.

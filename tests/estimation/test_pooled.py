@@ -12,13 +12,14 @@ import pytest
 
 from bimfit.config import FitConfig, SensorConfig
 from bimfit.estimation import _kernels
+from bimfit.estimation.cells import with_shared_cells
 from bimfit.estimation.likelihood import BeamModel, BeamSet, edge_rows
 from bimfit.estimation.motion import estimate_joint
 from bimfit.estimation.ownership import beam_table
 from bimfit.estimation.pooled import Beams, pooled
 from bimfit.estimation.posterior import Heard
 from bimfit.estimation.station import estimate_station
-from bimfit.estimation.trend import Sites, bowed, fit, polynomial, with_shared_cells
+from bimfit.estimation.trend import Sites, bowed, fit, polynomial
 from bimfit.geometry.pose import Pose2D
 
 
