@@ -21,7 +21,10 @@ def run(
     ),
     seed: int = typer.Option(1000, "--seed", min=0, help="Seed of the first joint."),
     case: str | None = typer.Option(
-        None, "--case", metavar="NAME", help="Of accuracy: this case alone, with all of the joints."
+        None,
+        "--case",
+        metavar="NAME",
+        help="Of accuracy, refusal: this one alone, with all joints.",
     ),
     json_file: Path | None = typer.Option(
         None, "--json", metavar="FILE", help="Write the figures there, too."
@@ -35,7 +38,7 @@ def run(
 
     if suite not in SUITES:
         raise ConfigError(f"unknown suite {suite}", remedy=f"choose from {', '.join(SUITES)}")
-    if case is not None and suite != "accuracy":
+    if case is not None and suite not in ("accuracy", "refusal"):
         raise ConfigError(f"the suite {suite} has no cases", remedy="leave --case out")
     with terminal_progress() as progress:
         result = bench(suite, joints=joints, seed=seed, progress=progress, case=case)

@@ -13,7 +13,7 @@ from bimfit.geometry.status import Status
 
 _SURE = 4.0
 """Standard deviations from which on pooled residuals are no accident."""
-_BENT, _BOTH = 3.5, 3.6
+_BENT, _BOTH = 3.7, 3.8
 """The same for a bend, one figure a component and not the best of many; and for both components' together."""
 _TAKES_PART = 2.5
 _MATTERS = 0.06

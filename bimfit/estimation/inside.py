@@ -12,11 +12,12 @@ from bimfit.estimation.cut_edges import Reshape, odds_of_cut_edges
 from bimfit.estimation.likelihood import BeamSet, edge_rows
 from bimfit.estimation.result import StationEstimate
 from bimfit.geometry.joint_section import JointSection
-from bimfit.geometry.pose import Pose2D
+from bimfit.geometry.pose import Array, Pose2D
 from bimfit.geometry.status import Status
 
 _SURE = 2.5
 _SAME = 4.0
+_CERTAIN = 2.5
 _FEW, _LAST = 12, 6
 _ON_CHAIN = 1e-6
 _SUSPICIOUS = 2.2
@@ -55,6 +56,13 @@ def returns_inside(
     step = beam_step(beams, float(np.median(beams.r[index])), sweeps)
     # what lies on a side itself, deep in the gap where a beam grazes it, is the component
     clear = _SURE * np.array(spread) + step
+    between = [
+        min(kernels.distance(x, y, side) - c for side, c in zip((a, b), clear.tolist(), strict=True)) > 0.0
+        for _, _, x, y in ends.tolist()
+    ]
+    ends = ends[between]
+    if not len(ends) or _from_behind(a, b, beams, ends, sigma):
+        return 0
     across = b[0] - a[0]
     across = across / max(math.hypot(across[0], across[1]), 1e-9)
     tried = np.repeat(np.array([[poses[0].as_array()], [poses[1].as_array()]]), 2, axis=1)
@@ -63,6 +71,24 @@ def returns_inside(
     tried[1, 1, :2] -= closer[1] * across
     rows = (edge_rows(section.components[0]), edge_rows(section.components[1]))
     return int(kernels.loose(ends, *rows, tried, a, b, _SAME * sigma, clear))
+
+
+def _from_behind(a: Array, b: Array, beams: BeamSet, ends: Array, sigma: float) -> bool:
+    """Whether returns from inside are the noise of a surface at or behind the root, by all near it together.
+
+    What stops beams less than four deviations on either side of the root's line is taken for one surface: it
+    is inside the gap where its mean is, by 2.5 of the mean's deviations.
+    """
+    root = b[-1] - a[-1]
+    depth = np.array([-root[1], root[0]]) / max(math.hypot(*root), 1e-9)
+    depth = depth if float(depth @ (a[0] + b[0] - a[-1] - b[-1])) < 0.0 else -depth
+    band = _SAME * sigma
+    deeper = np.concatenate([a[-1:], a[-1:] + band * depth, b[-1:] + band * depth, b[-1:]])
+    _, beyond = kernels.returns_within(deeper, beams.rays, beams.r, beams.start, beams.eye)
+    below = (np.concatenate([ends, beyond])[:, 2:] - a[-1]) @ depth
+    if below.min() < -band:
+        return False
+    return float(below.mean()) > -_CERTAIN * sigma / math.sqrt(len(below))
 
 
 def beam_step(beams: BeamSet, reach: float, sweeps: int) -> float:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bimfit.config import Config
+from bimfit.errors import ConfigError
 from bimfit.geometry.frame import SectionFrame
 from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.pose import Array
@@ -18,17 +19,16 @@ from bimfit.pipeline.samples import sample_model
 from bimfit.pipeline.simulate import designed, longest_open
 from bimfit.pipeline.survey import model_joints
 from bimfit.pipeline.targets import TargetCache, prepare
-from bimfit.simulation.impostors import BESIDE, FAR_OFF, IMPOSTORS, impostor, narrowed
 from bimfit.simulation.motion import random_truth
 from bimfit.simulation.rangefinder import simulate_scan
 from bimfit.simulation.scenario import Scenario
+from bimfit.simulation.scenes import SCENES, impostor, narrowed
 from bimfit.simulation.truth import JointTruth
 
 if TYPE_CHECKING:
     from bimfit.bim.joint import Joint
 
 Progress = Callable[[str, float], None]
-TRUE = "the joint itself"
 REFERENCE = "square-butt-ifc4.ifc"
 DEGRADED = {"clean": (0.0, 0.0), "degraded": (0.05, 0.05)}
 """Shares of outliers and of drop-outs."""
@@ -70,10 +70,20 @@ def bench_refusal(
     joints: int,
     seed: int,
     progress: Progress,
-    scenes: Sequence[str] = (TRUE, *IMPOSTORS),
+    scenes: Sequence[str] = tuple(SCENES),
     spacing: float = 0.010,
+    only: str | None = None,
 ) -> tuple[str, dict[str, Any]]:
-    """Every scene at so many seeded joints (83 slices at 10 mm), clean and degraded; text and data."""
+    """Every scene at so many seeded joints (83 slices at 10 mm), clean and degraded; text and data.
+
+    Raises
+    ------
+    ConfigError
+        Where there is no scene named ``only``.
+    """
+    if only is not None and only not in SCENES:
+        raise ConfigError(f"no case of that name: {only}", remedy=f"choose from: {'; '.join(SCENES)}")
+    scenes = scenes if only is None else (only,)
     model, found = model_joints(sample_model(REFERENCE), Config().joints)
     joint = longest_open(found)
     base = Scenario(spacing=spacing)
@@ -101,12 +111,12 @@ def _one(
     joint: Joint, sections: Sequence[JointSection], name: str, scenario: Scenario, seed: int, tally: Tally
 ) -> None:
     """One joint of one scene: every slice by itself, then all of them together."""
-    design = narrowed(sections, BESIDE[name]) if name in BESIDE else sections
-    there = design if name == TRUE else impostor(name, design, seed)
-    if name.endswith("far off"):
-        scenario = dataclasses.replace(scenario, common_shift=(FAR_OFF, scenario.common_shift[1]))
+    scene = SCENES[name]
+    design = sections if scene.width is None else narrowed(sections, scene.width)
+    there = impostor(name, design, seed)
+    scenario = dataclasses.replace(scenario, **scene.changes)
     truth = random_truth(design, scenario, seed, joint_id=joint.id, elements=joint.elements)
-    slices = scanned(there, truth, scenario, seed)
+    slices = [displaced(cut, scene.shift) for cut in scanned(there, truth, scenario, seed)]
     config = Config()
     sensor = dataclasses.replace(
         config.sensor,
@@ -127,7 +137,7 @@ def _one(
             continue
         middle = 0.5 * (a.apply(section.gap.mouth[0]) + b.apply(section.gap.mouth[1]))
         real = section.frame.to_section(truth.stations[i].gap.origin)[:2]
-        errors[i] = float(np.hypot(*(middle - real)))
+        errors[i] = float(np.hypot(*(middle - real - (scene.shift, 0.0))))
         if errors[i] > NEAR:
             tally.wrong += 1
             tally.wrong_flagged += estimate.status.name != "ok"
@@ -160,10 +170,18 @@ def _slice(frame: SectionFrame, s: float, origins: Array, directions: Array, ran
     return Slice(s, beams.points, beams, beams.origins.mean(axis=0), 1)
 
 
+def displaced(cut: Slice, shift: float) -> Slice:
+    """A slice placed ``shift`` too far along u, m."""
+    if shift == 0.0 or cut.beams is None:
+        return cut
+    beams = Beams(cut.beams.origins + np.array([shift, 0.0]), cut.beams.directions, cut.beams.ranges)
+    return Slice(cut.s, beams.points, beams, beams.origins.mean(axis=0), cut.sweeps)
+
+
 def _table(tallies: dict[str, dict[str, Tally]]) -> str:
     lines = [
         f"{'scene':22}{'':10}{'slices':>7}{'not ok':>16}{'no number':>11}{'in the joint':>14}"
-        f"{'whole joints':>14}{'over 5 mm: flagged':>20}{'right: number, ok':>20}"
+        f"{'whole joints':>14}{'over 5 mm: flagged':>20}{'right: number, ok':>20}  asked"
     ]
     for name, row in tallies.items():
         for how, t in row.items():
@@ -171,7 +189,7 @@ def _table(tallies: dict[str, dict[str, Tally]]) -> str:
                 f"{name:22}{how:10}{t.slices:7d}{f'{t.flagged} = {_percent(t.flagged, t.slices)}':>16}"
                 f"{t.refused:11d}{_percent(t.joint_flagged, t.slices):>14}"
                 f"{f'{t.joints_flagged} of {t.joints}':>14}{f'{t.wrong_flagged} of {t.wrong}':>20}"
-                f"{f'{t.right_measured}, {t.right_ok} of {t.right}':>20}"
+                f"{f'{t.right_measured}, {t.right_ok} of {t.right}':>20}  {SCENES[name].asked}"
             )
     return "\n".join(lines)
 

@@ -1,9 +1,8 @@
-"""Scenes that are not the designed joint, or not quite: what is to be refused (METHOD, section 5)."""
+"""Components that are not the designed ones, or not quite: what is to be refused (METHOD, section 5)."""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
@@ -13,30 +12,16 @@ from bimfit.geometry.profile import Profile
 
 Random = np.random.Generator
 NOTHING = Profile(())
-
-
-def impostor(kind: str, sections: Sequence[JointSection], seed: int) -> tuple[JointSection, ...]:
-    """The sections with other components in them: what is really there when the design is not.
-
-    Parameters
-    ----------
-    kind : str
-        A name of :data:`IMPOSTORS`.
-    sections : sequence of JointSection
-        The design of a butt joint between two boards.
-    seed : int
-        What is drawn (sizes, places) is drawn once for the joint, clutter anew at each station.
-    """
-    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,)))
-    make = IMPOSTORS[kind](rng)
-    return tuple(dataclasses.replace(section, components=make(section)) for section in sections)
+_WALL = 0.6
+"""Half the width of a wall, m."""
 
 
 Pair = tuple[Profile, Profile]
 Maker = Callable[[JointSection], Pair]
 
 
-def _missing(rng: Random) -> Maker:
+def missing(rng: Random) -> Maker:
+    """One of the components, drawn once, is not there."""
     which = int(rng.integers(2))
 
     def make(section: JointSection) -> Pair:
@@ -46,18 +31,22 @@ def _missing(rng: Random) -> Maker:
     return make
 
 
-def _wall(rng: Random) -> Maker:
+def plain_wall(rng: Random) -> Maker:
+    """A flat wall in place of both."""
     return lambda section: (box(-0.5, 0.5, -0.03, 0.0), NOTHING)
 
 
-def _pipe(rng: Random) -> Maker:
+def pipe(rng: Random) -> Maker:
+    """A pipe of 30 to 100 mm radius."""
     radius, centre = rng.uniform(0.03, 0.10), rng.uniform(-0.02, 0.02)
     t = np.linspace(0.0, 2.0 * np.pi, 96, endpoint=False)
     ring = Profile.polygon(np.stack([radius * np.cos(t) + centre, radius * (np.sin(t) - 1.0)], axis=1))
     return lambda section: (ring, NOTHING)
 
 
-def _clutter(rng: Random) -> Maker:
+def clutter(rng: Random) -> Maker:
+    """Eight boxes anywhere, drawn anew at each station."""
+
     def make(section: JointSection) -> Pair:
         left, wide, top = rng.uniform(-0.15, 0.12, 8), rng.uniform(0.01, 0.04, 8), rng.uniform(-0.1, 0.06, 8)
         boxes = [box(x, x + w, z - 0.03, z) for x, w, z in zip(left, wide, top, strict=True)]
@@ -66,7 +55,7 @@ def _clutter(rng: Random) -> Maker:
     return make
 
 
-def _bevel(rng: Random) -> Maker:
+def bevel(rng: Random) -> Maker:
     """A V-groove of the designed mouth's width, 4 mm open at its root, where the design is square."""
     land, root = 0.003, 0.002
 
@@ -86,7 +75,61 @@ def _bevel(rng: Random) -> Maker:
     return make
 
 
-def _wide(rng: Random) -> Maker:
+def chamfered(size: float) -> Callable[[Random], Maker]:
+    """Boards whose edges at the mouth are cut off at 45 degrees."""
+
+    def of(rng: Random) -> Maker:
+        def make(section: JointSection) -> Pair:
+            parts = []
+            for component, side in zip(
+                section.components, (section.gap.side_a, section.gap.side_b), strict=True
+            ):
+                (u0, v0), (u1, v1) = component.bounds
+                mouth = float(side[0][0])
+                outer, sign = (u0, -1.0) if u0 + u1 < 2.0 * mouth else (u1, 1.0)
+                ring = [(mouth + sign * size, v1), (outer, v1), (outer, v0), (mouth, v0), (mouth, v1 - size)]
+                parts.append(Profile.polygon(ring))
+            return parts[0], parts[1]
+
+        return make
+
+    return of
+
+
+def thick(thickness: float) -> Callable[[Random], Maker]:
+    """Boards of another thickness, their upper faces where they should be."""
+
+    def of(rng: Random) -> Maker:
+        def make(section: JointSection) -> Pair:
+            parts = []
+            for component in section.components:
+                (u0, _), (u1, v1) = component.bounds
+                parts.append(box(u0, u1, v1 - thickness, v1))
+            return parts[0], parts[1]
+
+        return make
+
+    return of
+
+
+def backed(distance: float) -> Callable[[Random], Maker]:
+    """The joint itself, and a wall so far behind its boards."""
+
+    def of(rng: Random) -> Maker:
+        def make(section: JointSection) -> Pair:
+            a, b = section.components
+            low = float(min(a.bounds[0][1], b.bounds[0][1])) - distance
+            wall = box(-_WALL, _WALL, low - 0.05, low)
+            return Profile((*a.loops, *wall.loops)), b
+
+        return make
+
+    return of
+
+
+def too_wide(rng: Random) -> Maker:
+    """A gap that is 40 mm wider than designed."""
+
     def make(section: JointSection) -> Pair:
         a, b = section.components
         return a.moved(Pose2D(-0.020)), b.moved(Pose2D(0.020))
@@ -94,11 +137,12 @@ def _wide(rng: Random) -> Maker:
     return make
 
 
-def _empty(rng: Random) -> Maker:
+def nothing(rng: Random) -> Maker:
+    """No component at all."""
     return lambda section: (NOTHING, NOTHING)
 
 
-def _bowed(rise: float) -> Callable[[Random], Maker]:
+def arched(rise: float) -> Callable[[Random], Maker]:
     """Boards whose upper faces are arched (or hollow, at random) by ``rise`` in their middle."""
 
     def of(rng: Random) -> Maker:
@@ -113,7 +157,7 @@ def _bowed(rise: float) -> Callable[[Random], Maker]:
     return of
 
 
-def _beside(count: int, width: float) -> Callable[[Random], Maker]:
+def beside(count: int, width: float) -> Callable[[Random], Maker]:
     """So many equal boards in a row with equal gaps; the joint is between two of the inner ones."""
 
     def of(rng: Random) -> Maker:
@@ -148,39 +192,3 @@ def bowed(profile: Profile, rise: float, pieces: int = 40) -> Profile:
     u = np.linspace(u1, u0, pieces + 1)
     top = v1 + rise * (1.0 - ((2.0 * u - u0 - u1) / (u1 - u0)) ** 2)
     return Profile.polygon(np.concatenate([[(u0, v0), (u1, v0)], np.column_stack([u, top])]))
-
-
-IMPOSTORS: dict[str, Callable[[Random], Maker]] = {
-    "missing component": _missing,
-    "plain wall": _wall,
-    "pipe": _pipe,
-    "clutter": _clutter,
-    "bevel for square": _bevel,
-    "gap 40 mm too wide": _wide,
-    "empty slice": _empty,
-    "bow 1 mm": _bowed(0.001),
-    "bow 2 mm": _bowed(0.002),
-    "bow 5 mm": _bowed(0.005),
-    "three boards": _beside(3, 0.070),
-    "four boards": _beside(4, 0.060),
-    "four boards, far off": _beside(4, 0.060),
-}
-"""Every scene: a maker of components, once drawn."""
-
-FAR_OFF = 0.060
-"""How far the joint as a whole may be shifted across in the scenes named so, m."""
-BESIDE = {"three boards": 0.070, "four boards": 0.060, "four boards, far off": 0.060}
-"""Scenes in which the joint's own boards have this width (m), as designed and as built."""
-
-
-def narrowed(sections: Sequence[JointSection], width: float) -> tuple[JointSection, ...]:
-    """A butt joint's design with boards of another width, m."""
-    out = []
-    for section in sections:
-        parts = []
-        for component, mouth, sign in zip(section.components, section.gap.mouth, (-1.0, 1.0), strict=True):
-            (_, v0), (_, v1) = component.bounds
-            inner = float(mouth[0])
-            parts.append(box(min(inner, inner + sign * width), max(inner, inner + sign * width), v0, v1))
-        out.append(dataclasses.replace(section, components=(parts[0], parts[1])))
-    return tuple(out)

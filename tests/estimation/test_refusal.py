@@ -63,6 +63,21 @@ def test_returns_from_inside_are_counted_and_those_from_the_floor_are_not():
             assert count > 3
 
 
+def test_a_wall_behind_the_boards_is_not_inside_and_a_filler_between_them_is():
+    sec, pose = S.butt(), Pose2D()
+    counts = {}
+    for depth in (-0.015, -0.025, -0.030):
+        wall = box(-0.3, 0.3, depth - 0.01, depth) if depth < -0.02 else box(-0.012, 0.012, -0.025, depth)
+        slices = [S.scan(np.random.default_rng(k), [*sec.components, wall]) for k in range(40)]
+        found = [returns_inside(sec, BeamSet.of(s.beams), (pose, pose), (5e-4, 5e-4), 0.003) for s in slices]
+        counts[depth] = sum(n > 0 for n in found)
+        e = estimate_station(sec, slices[0], pose, SENSOR, FIT)
+        assert (e.status.name == "ok") == (depth < -0.02)
+    assert counts[-0.015] == 40
+    assert counts[-0.025] <= 2
+    assert counts[-0.030] <= 1
+
+
 def _joint(shape, stations=83, seed=5):
     sec = S.butt()
     rng = np.random.default_rng(seed)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from bimfit.pipeline.bench_refusal import TRUE, bench_refusal
+from bimfit.pipeline.bench_refusal import bench_refusal
+from bimfit.simulation.scenes import TRUE
 
 
 def test_a_bevel_is_refused_and_the_joint_itself_is_kept():
