@@ -26,6 +26,8 @@ Motion = Literal["independent", "const", "rigid", "linear", "smooth", "kinked", 
 _KEEP_KNOT = 30.0
 _KINKED_MARGIN = 20.0
 _FEW = 3
+_STRAIGHT = 2
+"""Knots of a motion that has no kink."""
 _FEW_PARAMETERS = ("const", "rigid", "linear")
 _BOTH = 0.5
 """Stations that count for less than that, both components of them, have moved and are no outliers."""
@@ -99,8 +101,9 @@ def estimate_joint(
     estimates, sections : sequence
         One a station, in the order of the joint.
     model : {"independent", "const", "rigid", "linear", "smooth", "kinked", "auto"}
-        ``rigid``: u and v linear, theta constant. ``auto`` chooses by BIC, and ``independent`` where less
-        than half of the measured stations are ``ok``.
+        ``rigid``: u and v linear, theta constant; ``linear``: theta too, and so little of a bow in u and v as
+        comes with turning (:func:`bimfit.estimation.trend.bowed`). ``auto`` chooses by BIC, and
+        ``independent`` where less than half of the measured stations are fixed in all directions.
 
     Returns
     -------
@@ -136,8 +139,14 @@ def estimate_joint(
         if name == "kinked":
             screen = fits.get("smooth") or _fit_pair(parts, _bases("smooth", parts, knots))
             knots = _find_knots(parts, _weights(screen))
+            if len(knots) == _STRAIGHT and "linear" in fits:
+                continue  # no kink
         bases[name] = _bases(name, parts, knots)
-        pair = fits[name] = _fit_pair(parts, bases[name])
+        pair = _fit_pair(parts, bases[name])
+        if name == "linear":
+            bases[name] = (trend.bowed(bases[name][0], pair),) * 2
+            pair = _fit_pair(parts, bases[name])
+        fits[name] = pair
         # the smooth model's two hyper-parameters a component are fitted too
         freedom = sum(t.freedom for t in pair) + (4.0 if name == "smooth" else 0.0)
         if name == "kinked":
@@ -167,20 +176,17 @@ def _refined(
     """
     name = _choose(criterion)
     trends: list[Trend] = []
-    used: list[Basis] = []
     for which, sites in enumerate(parts):
         basis = bases[name][which]
         rough = with_shared_cells(sites, basis, fits[name][which])
         better = None
         if name in _FEW_PARAMETERS:
-            bowed, start = trend.bowed(basis, rough, fits[name])
-            better, borne_out = pooled(stations, sections, which, sites, bowed, start)
+            better, borne_out = pooled(stations, sections, which, sites, basis, rough)
             others = {n: c for n, c in criterion.items() if n not in _FEW_PARAMETERS}
             if not borne_out and others:
                 return _refined(stations, sections, parts, fits, bases, others)
         trends.append(rough if better is None else better)
-        used.append(basis if better is None else bowed)
-    return name, (trends[0], trends[1]), (used[0], used[1])
+    return name, (trends[0], trends[1]), bases[name]
 
 
 def _mostly_sound(stations: Sequence[StationEstimate]) -> bool:

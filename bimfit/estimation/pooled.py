@@ -26,16 +26,16 @@ from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.pose import Array
 
 _NU = 6
-_DRAWS = 512
+_DRAWS = 1024
 _ROUNDS = 20
-_ENOUGH = 0.12
+_ENOUGH = 0.06
 """Effective share of the draws that a step of the tempering keeps."""
 _WIDER = 1.5
 """How much wider, as a variance, the proposal is than what was found."""
 _REST = 0.01
 """And that share of the last proposal: never degenerate, however few draws count."""
-_CALM = 2
-"""So many rounds at the full likelihood in a row."""
+_EFFECTIVE = 200.0
+"""So many draws, and two rounds of them, must count at the full likelihood."""
 _JUMPED = 0.5
 _FEW = 3
 
@@ -140,7 +140,7 @@ def _ends(counts: Sequence[int]) -> Ints:
 
 @lru_cache(maxsize=16)
 def _draws(dimensions: int) -> tuple[Array, Array]:
-    """Student deviates (nu = 6), shape (512, dimensions), and their log density."""
+    """Student deviates (nu = 6), shape (1024, dimensions), and their log density."""
     from scipy.special import gammaln
     from scipy.stats import chi2, norm, qmc
 
@@ -242,10 +242,12 @@ def _sampled(beams: Beams, basis: Basis, trend: Trend) -> tuple[Array, Array] | 
     Q += _precision(basis)
     z, density = _draws(len(q))
     full = np.zeros((len(z), free.size))
-    centre, power, calm = np.zeros(len(q)), 0.0, 0
-    for _ in range(_ROUNDS):
+    centre, power = np.zeros(len(q)), 0.0
+    calm: list[tuple[float, Array, Array]] = []
+    for turn in range(_ROUNDS):
         try:
-            x = centre + z @ np.linalg.cholesky(shape).T
+            # other draws of the same density every time
+            x = centre + (-1) ** turn * np.roll(z, turn, axis=1) @ np.linalg.cholesky(shape).T
         except np.linalg.LinAlgError:
             return None
         full[:, free] = x
@@ -256,10 +258,18 @@ def _sampled(beams: Beams, basis: Basis, trend: Trend) -> tuple[Array, Array] | 
         cov = ((x - centre) * w[:, None]).T @ (x - centre)
         shape = _WIDER * cov + _REST * shape
         if power == 1.0:
-            calm += 1
-            if calm == _CALM:
-                return centre, cov
-    return None
+            calm.append((float(1.0 / np.sum(w * w)), centre, cov))
+            if len(calm) > 1 and sum(count for count, _, _ in calm) >= _EFFECTIVE:
+                break
+    return _together(calm) if len(calm) > 1 else None
+
+
+def _together(parts: Sequence[tuple[float, Array, Array]]) -> tuple[Array, Array]:
+    """Mean and covariance of several sets of draws, given by how many each is worth, and its own two."""
+    total = sum(count for count, _, _ in parts)
+    mean = np.asarray(sum(count / total * part for count, part, _ in parts))
+    cov = sum(count / total * (own + np.outer(part - mean, part - mean)) for count, part, own in parts)
+    return mean, np.asarray(cov)
 
 
 def _tempered(log: Array, power: float) -> tuple[float, Array]:

@@ -7,7 +7,7 @@ x = (u, v, theta). Stations enter by what their ranges say alone: precision L_i 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -21,7 +21,7 @@ NODES = 150
 _NU = 4.0
 _JUMP = np.array([0.004, 0.004, 0.035])
 """What a station that jumps is off by, standard deviations in u, v (m) and theta (rad)."""
-_OWN, _STRAIGHT = 0.003, 2e-6
+_OWN, _TURN = 0.003, math.radians(1.0)
 _JUMPS = 0.01
 """Share of stations that jump."""
 
@@ -94,7 +94,7 @@ class Basis:
     Attributes
     ----------
     functions : ndarray, shape (n, k)
-        At most two neighbouring ones differ from zero at a station.
+        Three or fewer, or else at most two neighbouring ones differ from zero at a station.
     moves : ndarray of bool, shape (k, 3)
     penalty : ndarray, shape (k, k, 3), or None
         Prior precision of the coefficients, one matrix a coordinate.
@@ -106,7 +106,9 @@ class Basis:
 
     @cached_property
     def local(self) -> tuple[NDArray[np.int64], Array]:
-        """The first of the two functions at every station (n,), and their values (n, 2)."""
+        """The first of the functions that count at every station (n,), and their values (n, 2 or 3)."""
+        if self.functions.shape[1] <= 3:
+            return np.zeros(len(self.functions), np.int64), self.functions
         first = np.minimum(np.argmax(self.functions != 0.0, axis=1), self.functions.shape[1] - 2)
         at = first[:, None] + np.arange(2)
         return first, np.take_along_axis(self.functions, at, axis=1)
@@ -124,30 +126,25 @@ def polynomial(s: Array, *, turning: bool, moving: bool = True) -> Basis:
     return Basis(np.stack([np.ones_like(t), t], axis=1), moves)
 
 
-def bowed(basis: Basis, rough: Trend, pair: tuple[Trend, Trend]) -> tuple[Basis, Trend]:
+def bowed(basis: Basis, pair: tuple[Trend, Trend]) -> Basis:
     """A linear motion that may bow a little: what moves within a joint that turns moves along a curve.
+
+    ``pair`` is the motion of both components as far as it is linear.
 
     A shift d(t) of a component within a joint that has turned by phi(t) is seen as R(phi(t)) d(t): with both
     linear in t from -1/2 to 1/2, over which they change by D and Phi, that bows by 4 t^2 (Phi perp(D) / 4).
     What of their turning and their drift the joint has and what they have of their own is not known: Phi is
-    of the size of their changes of angle, and D of half of what they drift apart by, and 3 mm besides.
+    of the size of their changes of angle and a degree besides, and D of half of what they drift apart by and
+    3 mm besides.
     """
     t = basis.functions[:, 1]
     a, b = (p.value[-1] - p.value[0] for p in pair)
-    turn = math.sqrt(0.5 * float(a[2] ** 2 + b[2] ** 2))
+    turn = math.sqrt(0.5 * float(a[2] ** 2 + b[2] ** 2) + _TURN**2)
     sd = 0.25 * turn * math.hypot(0.5 * float(np.hypot(*(b - a)[:2])), _OWN)
-    if sd < _STRAIGHT or not basis.moves[1, 2]:
-        return basis, rough
     functions = np.column_stack([basis.functions, 4.0 * t * t - 1.0 / 3.0])
     penalty = np.zeros((3, 3, 3))
     penalty[2, 2, :2] = sd**-2
-    free = len(rough.spread)
-    spread = np.zeros((free + 2, free + 2))
-    spread[:free, :free] = rough.spread
-    spread[free:, free:] = np.eye(2) * sd**2
-    return Basis(functions, np.vstack([basis.moves, [[True, True, False]]]), penalty), replace(
-        rough, spread=spread
-    )
+    return Basis(functions, np.vstack([basis.moves, [[True, True, False]]]), penalty)
 
 
 def nodes(s: Array) -> Array:
@@ -183,8 +180,8 @@ def information(basis: Basis, blocks: Array) -> Array:
     k = basis.functions.shape[1]
     first, w = basis.local
     A = np.zeros((k, k, 3, 3))
-    for p in (0, 1):
-        for q in (0, 1):
+    for p in range(w.shape[1]):
+        for q in range(w.shape[1]):
             np.add.at(A, (first + p, first + q), blocks * (w[:, p] * w[:, q])[:, None, None])
     return A.transpose(0, 2, 1, 3).reshape(3 * k, 3 * k)
 
@@ -220,8 +217,8 @@ def at_stations(M: Array, basis: Basis) -> Array:
     M = M.reshape(k, 3, k, 3)
     first, w = basis.local
     out = np.zeros((len(first), 3, 3))
-    for p in (0, 1):
-        for q in (0, 1):
+    for p in range(w.shape[1]):
+        for q in range(w.shape[1]):
             out += M[first + p, :, first + q, :] * (w[:, p] * w[:, q])[:, None, None]
     return out
 

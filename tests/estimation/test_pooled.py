@@ -217,7 +217,7 @@ def test_bow_of_what_moves_in_a_turning_joint_is_within_its_prior():
         parts = [Sites(s, v, precision, np.full(41, np.nan), np.ones(41)) for v in values]
         line = polynomial(s, turning=True)
         pair = tuple(fit(p, line) for p in parts)
-        basis, _ = bowed(line, pair[0], pair)
+        basis = bowed(line, pair)
         bow = np.linalg.lstsq(basis.functions, values[0], rcond=None)[0][2, :2]
         scores.append(bow * np.sqrt(basis.penalty[2, 2, :2]))
         rest = values[0] - basis.functions @ np.linalg.lstsq(basis.functions, values[0], rcond=None)[0]
