@@ -36,7 +36,7 @@ CRS: tuple[Crs, ...] = ("auto", "project", "map")
 NEAR = 0.3
 _PIECE = 0.5
 _SLACK = 0.05
-_OTHER_UNITS = (1e-3, 1e3, 1e-2, 1e2, 0.3048, 1.0 / 0.3048)
+_OTHER_UNITS = (1e-3, 1e3, 1e-2, 1e2, 0.3048, 1.0 / 0.3048, 1200.0 / 3937.0)
 _SMALLEST = 0.02
 
 

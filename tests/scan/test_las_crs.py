@@ -100,7 +100,8 @@ def test_files_are_read_in_the_unit_that_they_state(tmp_path, name, ending):
     scan = read_scan(path)
     # half a step of 0.1 mm or 0.1 milli-foot
     np.testing.assert_allclose(scan.points, POINTS, atol=6e-5)
-    assert any("coordinate system" in note for note in scan.notes) == (unit != 1.0)
+    assert any("coordinate system is in" in note for note in scan.notes) == (unit != 1.0)
+    assert any("EPSG:2263" in note and "--scan-unit" in note for note in scan.notes) == (name == "code alone")
     assert unit_taken(path) == unit
     box = np.array([[[300_000.0, 60_000.0, 12.0], [300_002.0, 60_002.0, 14.0]]])
     within = np.all((box[0, 0] <= POINTS) & (box[0, 1] >= POINTS), axis=1)

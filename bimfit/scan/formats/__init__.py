@@ -83,7 +83,7 @@ class Format:
     chunks : callable or None
         (path, options) -> pieces of the scan; None where the file is only read whole.
     states : callable or None
-        Metres a unit of length that a file itself states, None where it does not; None where no file does.
+        Metres a unit of length that a file itself states, or None, and a note; None where no file does.
     """
 
     name: str
@@ -96,7 +96,7 @@ class Format:
     unit: float = 1.0
     sized: bool = False
     chunks: Callable[[Path, ReadOptions], Iterator[Scan]] | None = None
-    states: Callable[[Path], float | None] | None = None
+    states: Callable[[Path], tuple[float | None, str]] | None = None
 
 
 def _plain(read: Callable[[Path], Scan]) -> Callable[[Path, ReadOptions], Scan]:
@@ -212,11 +212,11 @@ def _with_stated_unit(
     if options.unit is not None or form.states is None:
         return options, ()
     try:
-        unit = form.states(inner)
+        unit, note = form.states(inner)
     except ScanError as error:
         raise ScanError(error.message, file=source, place=error.place, remedy=error.remedy) from error
     if unit is None or unit == form.unit:
-        return options, ()
+        return options, (note,) if note else ()
     return replace(options, unit=unit), (f"its coordinate system is in {unit_name(unit)}",)
 
 

@@ -24,10 +24,11 @@ _UNIT = ("UNIT", "LENGTHUNIT")
 _TOKEN = re.compile(r'"((?:[^"]|"")*)"|([A-Za-z_][A-Za-z0-9_]*)|([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)|([][(),])')
 _MOST_TEXT = 1 << 16
 # keys of GeoTIFF 1.1 and codes of its linear units
-_MODEL, _LINEAR, _LINEAR_SIZE, _UPRIGHT = 1024, 3076, 3077, 4099
+_MODEL, _SYSTEM, _LINEAR, _LINEAR_SIZE, _UPRIGHT = 1024, 3072, 3076, 3077, 4099
 _IN_DEGREES = 2
 _CODES = {9001: 1.0, 9002: UNITS["ft"], 9003: UNITS["usft"]}
 _LEAST, _MOST = 1e-4, 1e4
+_OWN, _LONGEST = 32767, 40
 
 
 @dataclass(frozen=True)
@@ -47,8 +48,14 @@ class _Node:
             waiting.extend(reversed(node.children))
 
 
-def las_unit(path: Path) -> float | None:
+def las_unit(path: Path) -> tuple[float | None, str]:
     """Metres a unit of length, as the file's coordinate system states; None where it states none.
+
+    Returns
+    -------
+    unit : float or None
+    note : str
+        That a coordinate system is named and its unit is not, else empty.
 
     Raises
     ------
@@ -60,7 +67,7 @@ def las_unit(path: Path) -> float | None:
     try:
         import laspy
     except ImportError:
-        return None  # reading it says so
+        return None, ""  # reading it says so
     check_header(path)
     with las_errors(path), laspy.open(path) as reader:
         records = [*reader.header.vlrs, *(reader.header.evlrs or ())]
@@ -79,7 +86,7 @@ def las_unit(path: Path) -> float | None:
         except ValueError as error:
             raise ScanError(str(error), file=path, remedy="give --scan-unit") from error
     else:
-        return None
+        return None, ""
     if degrees:
         raise ScanError(
             "its positions are longitudes and latitudes in degrees", file=path, remedy="project it first"
@@ -90,7 +97,15 @@ def las_unit(path: Path) -> float | None:
             file=path,
             remedy="convert it to one unit, or give --scan-unit if all three are in one",
         )
-    return flat
+    return flat, _without_unit(text, keys) if flat is None else ""
+
+
+def _without_unit(text: str | None, keys: Any) -> str:
+    """A note that a coordinate system is named whose unit is not, if there is one."""
+    names = [] if text is None else [n.values[0] for r in _parsed(text) for n in r.walk() if n.values]
+    codes = [] if keys is None else [int(k.value_offset) for k in keys.geo_keys if int(k.id) == _SYSTEM]
+    name = f"EPSG:{codes[0]}" if codes and codes[0] != _OWN else str(names[0])[:_LONGEST] if names else ""
+    return f"its coordinate system ({name}) states no unit of length: --scan-unit does" if name else ""
 
 
 def units_of_wkt(text: str) -> tuple[float | None, float | None, bool]:
