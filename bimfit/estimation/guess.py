@@ -54,9 +54,14 @@ def guessed_section(s: float, frame: SectionFrame, beams: Beams, sigma: float, d
         # from outside inwards
         mine = mine[np.argsort(-np.abs(across[mine] - middle), kind="stable")]
         own = _to_the_edge(eye, bearing[mine], ranges[mine], sigma)
-        line, open_end = surface_line(bearing[mine], own, step, sigma, least=1)
+        line, open_end = np.zeros((0, 2)), [False, False]
+        if np.isfinite(own).any():
+            line, open_end = surface_line(bearing[mine], own, step, sigma, least=1)
         if len(line) < 2:
-            raise ScanError(f"too few returns to guess component {name} from", remedy="give more slices")
+            raise ScanError(
+                f"too few returns to guess component {name} from",
+                remedy="see that --line runs along the gap, or give more --slices",
+            )
         points = eye + line[:, 1:2] * np.column_stack([np.cos(line[:, 0]), np.sin(line[:, 0])])
         if sign * (points[0] - points[-1])[0] > 0.0:
             points, open_end = points[::-1], open_end[::-1]

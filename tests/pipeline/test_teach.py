@@ -199,6 +199,17 @@ def test_a_line_and_a_scan_teach_a_profile_without_a_model(tmp_path, capsys, for
     assert sum(s.status.name == "ok" for s in fit.stations) > 0.8 * len(sections)
 
 
+def test_a_line_that_runs_across_the_gap_is_refused_in_one_line(tmp_path, capsys):
+    x, y = np.meshgrid(np.linspace(-0.16, 0.16, 161), np.arange(0.0, 0.8, 0.01))
+    keep = np.abs(x) > 0.0125
+    np.savetxt(tmp_path / "s.xyz", np.column_stack([x[keep], y[keep], 0.0 * x[keep]]), fmt="%.4f")
+    words = ["teach", str(tmp_path / "s.xyz"), "--line", "0,0,0,0.8,0,0", "--out", "0,0,1"]
+    assert main([*words, "-o", str(tmp_path / "p.json")]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "too few returns to guess component" in line
+    assert "--line" in line
+
+
 def test_what_teach_is_asked_for_must_make_sense(tmp_path, capsys):
     scan = tmp_path / "s.xyz"
     scan.write_text("0 0 0\n0.1 0 0\n0 0.1 0\n" * 4)
