@@ -28,6 +28,7 @@ _HOMES = {
     "convert": "bimfit.pipeline.convert",
     "load_model": "bimfit.bim.model",
     "model_from_elements": "bimfit.bim.model",
+    "element_from_mesh": "bimfit.bim.model",
     "find_joints": "bimfit.bim.joints",
     "joint_between": "bimfit.bim.joints",
     "MATCHERS": "bimfit.registration.matchers",
@@ -74,6 +75,7 @@ __all__ = [
     "compare",
     "convert",
     "cut_joint",
+    "element_from_mesh",
     "find_joints",
     "fit_joint",
     "joint_between",
@@ -110,7 +112,7 @@ def __dir__() -> list[str]:
 
 if TYPE_CHECKING:
     from bimfit.bim.joints import find_joints, joint_between
-    from bimfit.bim.model import load_model, model_from_elements
+    from bimfit.bim.model import element_from_mesh, load_model, model_from_elements
     from bimfit.bim.selection import Selection, choose_joints
     from bimfit.config import Config, load_config
     from bimfit.errors import BimfitError

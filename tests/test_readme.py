@@ -13,13 +13,17 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 def test_python_of_the_readme_runs(monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
-    (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
-    exec(compile(code, "README.md", "exec"), {})
+    fits_a_model, fits_meshes = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    exec(compile(fits_a_model, "README.md", "exec"), {})
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 5  # every twentieth of 83 stations
     widths = [float(line.split()[-1]) for line in lines if not line.endswith("None")]
     assert len(widths) >= 4
     assert all(0.010 < width < 0.045 for width in widths)
+    exec(compile(fits_meshes, "README.md", "exec"), {})
+    width, sd = (float(x) for x in re.findall(r"[\d.]+", capsys.readouterr().out))
+    # two corners of the mouth 24 mm apart across and 2 mm out
+    assert abs(width - (24.0**2 + 2.0**2) ** 0.5) < 3.0 * sd + 0.1
 
 
 def test_pictures_of_the_readme_are_there():

@@ -21,7 +21,8 @@ from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.pose import Array, Pose2D
 from bimfit.geometry.slice import Slice
 from bimfit.pipeline.accuracy import gap_estimate, joint_errors
-from bimfit.pipeline.fit import METHODS, check_choice, fit_joint
+from bimfit.pipeline.fit import check_choice, fit_joint
+from bimfit.pipeline.fit import methods as known_methods
 from bimfit.pipeline.placing import Placing
 from bimfit.pipeline.records import JointResult
 from bimfit.pipeline.results import to_json
@@ -236,7 +237,7 @@ def check_methods(methods: Sequence[str]) -> None:
         Naming those that do.
     """
     if not methods:
-        raise ConfigError("no method named", remedy=f"choose from {', '.join(METHODS)}")
+        raise ConfigError("no method named", remedy=f"choose from {', '.join(known_methods())}")
     for method in methods:
         check_choice(method)
 

@@ -46,8 +46,6 @@ if TYPE_CHECKING:
 
 DESIGNED = Pose2D()
 _MATCHER_OF = {"paper": "block", "search": "grcsm"}
-METHODS = ("grcsm", "search", "paper", *(name for name in MATCHERS if name != "grcsm"))
-"""What :func:`fit_joint` can be asked for."""
 MOTIONS = ("auto", "independent", "const", "rigid", "linear", "smooth", "kinked")
 """Motion models along the joint."""
 _OTHER_SIGMA, _OTHER_SHARE = 0.1, 0.015
@@ -90,7 +88,7 @@ def fit_joint(
         The design and the scan at each station (:func:`bimfit.pipeline.survey.cut_joint`).
     config : Config
     method : str
-        A name of METHODS. ``grcsm`` is the certified search followed by the estimate of METHOD sections 4
+        One of :func:`methods`. ``grcsm`` is the certified search followed by the estimate of METHOD, 4
         and 5; ``search`` is that search alone; ``paper`` the method as printed (whole outlines, block
         tables, grid answers); every other matcher's own answer is reported as it is.
     motion : str
@@ -189,6 +187,11 @@ def fit_along(joint: Joint, fitted: SliceFits, motion: str = "auto") -> JointRes
     )
 
 
+def methods() -> tuple[str, ...]:
+    """What :func:`fit_joint` can be asked for; matchers that users add to MATCHERS are among them."""
+    return ("grcsm", "search", "paper", *(name for name in MATCHERS if name != "grcsm"))
+
+
 def check_choice(method: str, motion: str = "auto") -> None:
     """Refuse a method or a motion model that does not exist.
 
@@ -197,7 +200,7 @@ def check_choice(method: str, motion: str = "auto") -> None:
     ConfigError
         Naming those that do.
     """
-    for kind, name, known in (("method", method, METHODS), ("motion", motion, MOTIONS)):
+    for kind, name, known in (("method", method, methods()), ("motion", motion, MOTIONS)):
         if name not in known:
             raise ConfigError(f"unknown {kind} {name}", remedy=f"choose from {', '.join(known)}")
 
