@@ -30,6 +30,9 @@ Mask = NDArray[np.bool_]
 
 RANGE, OFF, DEEP, LIMIT, INVERSE, TOP = 3, 4, 5, 6, 7, 8
 STEEP = 0.3
+NEGLIGIBLE = 12.0
+"""What is so much less likely than the best is left out of the integral. The nodes of a profile are too rough
+for a sharper cut: at 7, tails were lost on one side, and a groove sat 0.03 mm deep."""
 NEVER = 1 << 40
 PAD = 8
 
@@ -949,7 +952,7 @@ def posterior(
         q[:] = pose
     first, final = nodes, -1
     for i in range(nodes):
-        if best[i] > top - 7.0:
+        if best[i] > top - NEGLIGIBLE:
             first = min(first, i)
             final = max(final, i)
     lo = (max(first - 1, 0) - mid) * step
@@ -1272,7 +1275,7 @@ def _integrate(
             x = s / step + mid
             i = min(max(int(x), 0), w.shape[0] - 2)
             f = x - i
-            if max(best[i], best[i + 1]) < top - 12.0:
+            if max(best[i], best[i + 1]) < top - NEGLIGIBLE:
                 continue
             wc[0] = w[i, 0] + f * (w[i + 1, 0] - w[i, 0])
             wc[1] = w[i, 1] + f * (w[i + 1, 1] - w[i, 1])
