@@ -140,7 +140,7 @@ def test_a_bow_agrees_with_dense_least_squares():
         return float(((z - design @ fit) ** 2).sum()), np.linalg.matrix_rank(design)
 
     without, with_bend, (full, rank) = left()[0], left(parabola)[0], left(steps)
-    assert np.isclose(abs(found.bow), np.sqrt((without - with_bend) * (len(x) - rank) / full), rtol=0.03)
+    assert np.isclose(abs(found.bow), np.sqrt((without - with_bend) * (len(x) - rank) / full), rtol=0.05)
 
 
 def test_a_station_amid_rejected_ones_is_not_believed():
