@@ -27,8 +27,8 @@ from bimfit.pipeline.records import ComponentResult, JointResult, StationResult
 from bimfit.pipeline.shape import StationShape, free_shapes, freedoms, judged, with_shape_sigma
 from bimfit.pipeline.stitch import area_correlation, stitch
 from bimfit.pipeline.targets import (
-    COMBINED_BREAK_EVEN,
-    COMPONENT_BREAK_EVEN,
+    COMBINED_PAYS,
+    COMPONENT_PAYS,
     TargetCache,
     Targets,
     build_seconds,
@@ -243,18 +243,19 @@ def search_stations(
     begin = time.perf_counter()
     name = _MATCHER_OF.get(method, method)
     near = [matched_slice(slice_, config) for slice_ in slices]
-    wide = economic(config.search, targets.stations, COMBINED_BREAK_EVEN)
+    wide = economic(config.search, targets.combined, targets.stations, COMBINED_PAYS)
     combined = match_all(name, targets.combined, near, [DESIGNED] * len(near), [wide] * len(near))
     found = [i for i, match in enumerate(combined) if match.found]
-    searches = [
-        economic(component_search(sections[i], config), targets.stations, COMPONENT_BREAK_EVEN) for i in found
-    ]
+    searches = [component_search(sections[i], config) for i in found]
     priors = [combined[i].pose for i in found]
     shares = [_shares(near[i], targets, combined[i].pose, method) for i in found]
     a, b = (
-        match_all(name, target, [share[which] for share in shares], priors, searches)
+        match_all(
+            name, target, [share[which] for share in shares], priors,
+            [economic(search, target, targets.stations, COMPONENT_PAYS) for search in searches],
+        )
         for which, target in enumerate(targets.components)
-    )
+    )  # fmt: skip
     components = dict(zip(found, zip(a, b, strict=True), strict=True))
     seconds = (time.perf_counter() - begin) / max(len(slices), 1)
     return [

@@ -19,8 +19,8 @@ from bimfit.geometry.visibility import clip_edges, visible_edges
 from bimfit.registration.table import Tables, Target
 from bimfit.simulation.rangefinder import aim
 
-COMBINED_BREAK_EVEN, COMPONENT_BREAK_EVEN = 80, 300
-"""Slices from which on majorant tables pay for themselves, in the wide and in a component's small window."""
+COMBINED_PAYS, COMPONENT_PAYS = 3000.0, 1000.0
+"""Cells of majorant tables that a slice pays for, in the wide and in a component's small window; measured."""
 _MARGIN = 0.1
 """How much farther than the components' profiles a scan is used, since they may have moved, m."""
 _FAR_VIEW, _FREE_VIEW = 1.0, 0.1
@@ -180,13 +180,14 @@ def prepare(sections: Sequence[JointSection], slices: Sequence[Slice], cache: Ta
     return [counted[id(targets)] for targets in found]
 
 
-def economic(search: SearchConfig, stations: int, break_even: int) -> SearchConfig:
+def economic(search: SearchConfig, target: Target, stations: int, pays: float) -> SearchConfig:
     """The same search by the bound that is cheaper in all, tables included.
 
-    Quadratic majorants search several times faster than overlapped block maxima but take far longer to build.
-    Both are proven and find the same pose.
+    Quadratic majorants search several times faster than overlapped block maxima but take longer to build, the
+    longer the more cells there are. Each station ``pays`` for so many of them. Both are proven and find the
+    same pose.
     """
-    if search.bound == "majorant" and stations < break_even:
+    if search.bound == "majorant" and stations * pays < target.cells(*search.tolerance[:2]):
         return dataclasses.replace(search, bound="overlap")
     return search
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from bimfit._kernels import jit, jit_fast, jit_inner_fast
 
 FULL = 255  # leaf value on the model itself
 LANE = 21  # bits of one of three sums that share a machine word
-MANY_TRIES = 12  # half a window up to which flatter quadratics are tried, too
 RIM = 16  # columns of zeros, or more, that end a row of a block table: rows are read in whole vectors
 # bits of a quadratic's word: constant, two slopes, three curvatures
 BITS_A, BITS_G, BITS_H = 16, 12, 8
@@ -99,135 +101,196 @@ def pack_quad(a, gu, gv, huu, huv, hvv):
     return low | (high << np.uint64(32))
 
 
-@jit_inner_fast
-def residual(wide, y, x, ru, rv, gu, gv, huu, huv, hvv):
-    """Greatest value over a window less gu du + gv dv + huu du^2 + huv du dv + hvv dv^2."""
-    least = np.float32(-1e30)
-    for a in range(2 * rv + 1):
-        dv = np.float32(a - rv)
-        line = np.uint64(y + a)
-        steady = dv * (gv + hvv * dv)
-        slope = gu + huv * dv
-        for b in range(2 * ru + 1):
-            du = np.float32(np.int32(b) - np.int32(ru))
-            least = max(least, wide[line, np.uint64(x + b)] - du * (slope + huu * du) - steady)
-    return least
+class Room(NamedTuple):
+    """Scratch arrays for one row of records, all (..., columns).
 
-
-@jit_fast
-def row_sums(wide, ru, eu, columns, sums, tops):
-    """Sums of value, value du and value du^2 (3, rows, columns), and tops, over each record's row windows."""
-    for y in range(wide.shape[0]):
-        line = np.uint64(y)
-        for x in range(columns):
-            s0, s1, s2, top = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
-            for b in range(2 * ru + 1):
-                du = np.float32(np.int32(b) - np.int32(ru))
-                value = wide[line, np.uint64((x << eu) + b)]
-                s0 += value
-                s1 += value * du
-                s2 += value * du * du
-                top = max(top, value)
-            sums[0, y, x], sums[1, y, x], sums[2, y, x] = s0, s1, s2
-            tops[y, x] = top
-
-
-@jit_fast
-def window_sums(sums, tops, y, rv, out):
-    """Sums over the windows of one row of records, in ``out`` (7, columns).
-
-    Of the value times 1, du, dv, du^2, du dv, dv^2; and the greatest value.
+    Sums over a window (6), terms of a row of cells (3), quadratics tried (fits + 1, 5; the last one flat),
+    the greatest residual; and a class: the least mean so far, its constant, and whose it is.
     """
-    for k in range(7):
-        for x in range(out.shape[1]):
-            out[k, x] = np.float32(0.0)
-    for a in range(2 * rv + 1):
-        dv = np.float32(a - rv)
-        for x in range(out.shape[1]):
-            s0, s1 = sums[0, y + a, x], sums[1, y + a, x]
-            out[0, x] += s0
-            out[1, x] += s1
-            out[2, x] += s0 * dv
-            out[3, x] += sums[2, y + a, x]
-            out[4, x] += s1 * dv
-            out[5, x] += s0 * dv * dv
-            out[6, x] = max(out[6, x], tops[y + a, x])
+
+    sums: NDArray[np.float32]
+    terms: NDArray[np.float32]
+    coef: NDArray[np.float32]
+    residual: NDArray[np.float32]
+    best: NDArray[np.float32]
+    constant: NDArray[np.float32]
+    chosen: NDArray[np.int32]
 
 
-@jit
+@jit_fast
+def row_sums(wide, first, ru, eu, sums):
+    """Sums of value, value du and value du^2 (3, rows, columns) over each record's row windows.
+
+    They begin at the record's cell ``first``.
+    """
+    sums[:] = np.float32(0.0)
+    for y in range(wide.shape[1]):
+        for b in range(2 * ru + 1):
+            du = np.float32(b - ru)
+            cells, shift = wide[(first + b) & ((1 << eu) - 1), y], (first + b) >> eu
+            for x in range(sums.shape[2]):
+                value = cells[np.uint64(x + shift)]
+                sums[0, y, x] += value
+                sums[1, y, x] += value * du
+                sums[2, y, x] += value * du * du
+
+
+@jit_fast
+def fitted(row_sums, y, ru, rv, unit_g, unit_h, sums, out):
+    """Least-squares slopes and curvatures (5, columns) of records of one row, in whole units.
+
+    ``row_sums`` (3, rows, columns): see there; windows reach ``ru`` and ``rv`` from the row ``y``. ``sums``
+    (6, columns): those of the value times 1, du, dv, du^2, du dv, dv^2 over a window.
+    """
+    columns = row_sums.shape[2]
+    sums[:] = np.float32(0.0)
+    for a in range(-rv, rv + 1):
+        dv = np.float32(a)
+        s0, s1, s2 = row_sums[0, y + a], row_sums[1, y + a], row_sums[2, y + a]
+        for x in range(columns):
+            sums[0, x] += s0[x]
+            sums[1, x] += s1[x]
+            sums[2, x] += s0[x] * dv
+            sums[3, x] += s2[x]
+            sums[4, x] += s1[x] * dv
+            sums[5, x] += s0[x] * dv * dv
+    nu, nv = 2.0 * ru + 1.0, 2.0 * rv + 1.0
+    mu, mv = ru * (ru + 1) / 3.0, rv * (rv + 1) / 3.0  # mean of du^2, dv^2
+    ku, kv = nu * (nu * nu - 1.0) * (nu * nu - 4.0) / 180.0, nv * (nv * nv - 1.0) * (nv * nv - 4.0) / 180.0
+    fu, hu = (1.0 / (nv * nu * mu * unit_g), 1.0 / (nv * ku * unit_h)) if ru > 0 else (0.0, 0.0)
+    fv, hv = (1.0 / (nu * nv * mv * unit_g), 1.0 / (nu * kv * unit_h)) if rv > 0 else (0.0, 0.0)
+    twist = 1.0 / (nu * mu * nv * mv * unit_h) if ru > 0 and rv > 0 else 0.0
+    for x in range(columns):
+        out[0, x] = whole(fu * sums[1, x], MOST_G)
+        out[1, x] = whole(fv * sums[2, x], MOST_G)
+        out[2, x] = whole(hu * (sums[3, x] - mu * sums[0, x]), MOST_H)
+        out[3, x] = whole(twist * sums[4, x], MOST_H)
+        out[4, x] = whole(hv * (sums[5, x] - mv * sums[0, x]), MOST_H)
+
+
+@jit_inner_fast
 def whole(value, most):
     """The nearest integer within -most .. most."""
-    return min(most, max(-most, int(np.rint(value))))
+    return np.float32(min(float(most), max(-float(most), np.rint(value))))
+
+
+@jit_fast
+def residuals(
+    wide, columns, y, eu, middle, inner_u, inner_v, ru, rv, unit_g, unit_h, coef, terms, least
+):  # fmt: skip
+    """Greatest value over each window of records of a row less their quadratics ``coef``, into ``least``.
+
+    Windows reach ``ru`` and ``rv`` to each side of the row ``y`` and of a record's
+    cell ``middle``; the part within ``inner``, -1 for none, has been gone through before. All records
+    at a time, the cells on both sides of the middle together: vector code.
+    """
+    phase = (1 << eu) - 1
+    gu, gv, huu, huv, hvv = coef[0], coef[1], coef[2], coef[3], coef[4]
+    steady, slope, bend = terms[0], terms[1], terms[2]
+    one, two = np.float32(unit_g), np.float32(unit_h)
+    for x in range(columns):
+        bend[x] = two * huu[x]
+    for a in range(-rv, rv + 1):
+        dv = np.float32(a)
+        for x in range(columns):
+            slope[x] = one * gu[x] + two * huv[x] * dv
+            steady[x] = dv * (one * gv[x] + two * hvv[x] * dv)
+        for b in range(inner_u + 1 if abs(a) <= inner_v else 0, ru + 1):
+            du, square = np.float32(b), np.float32(b * b)
+            left, low = wide[(middle - b) & phase, y + a], (middle - b) >> eu
+            right, high = wide[(middle + b) & phase, y + a], (middle + b) >> eu
+            for x in range(columns):
+                even, odd = steady[x] + square * bend[x], du * slope[x]
+                greater = max(left[np.uint64(x + low)] + odd, right[np.uint64(x + high)] - odd)
+                least[x] = max(least[x], greater - even)
+
+
+@jit_fast
+def better(fit, columns, ru, rv, unit_g, unit_h, own, room):
+    """Take quadratics of a row's records where they lie less above the table on average.
+
+    ``fit`` names them in ``room``, ``own`` the class of windows that reach ``ru`` and ``rv``.
+    """
+    coef, least = room.coef[fit], room.residual
+    best, constant, chosen = room.best[own], room.constant[own], room.chosen[own]
+    one, two = np.float32(unit_g), np.float32(unit_h)
+    wu, wv = np.float32(ru), np.float32(rv)
+    mu, mv = np.float32(ru * (ru + 1) / 3.0), np.float32(rv * (rv + 1) / 3.0)
+    for x in range(columns):
+        slopes = one * (abs(coef[0, x]) * wu + abs(coef[1, x]) * wv)
+        bends = two * (abs(coef[2, x]) * wu * wu + abs(coef[3, x]) * wu * wv + abs(coef[4, x]) * wv * wv)
+        # single precision: terms of the sum's magnitude lose a few parts in ten million
+        margin = np.float32(0.06) + np.float32(1e-6) * (abs(least[x]) + slopes + bends)
+        a = np.ceil(least[x] + (margin if slopes + bends > np.float32(0.0) else np.float32(0.0)))
+        mean = a + two * (coef[2, x] * mu + coef[4, x] * mv)
+        good = np.float32(0.0) <= a <= np.float32(MOST_A) and mean < best[x]
+        best[x] = mean if good else best[x]
+        constant[x] = a if good else constant[x]
+        chosen[x] = fit if good else chosen[x]
 
 
 @jit
-def quad_table(leaf, ru, rv, eu, ev, rim_u, rim_v, scale, unit_g, unit_h, out):
-    """Quadratic majorants: scale leaf[c + d] <= A + g . d + d' h d for d within ru, rv of a record's cells.
+def pack_row(ru, rv, unit_g, unit_h, own, room, out):
+    """Words of a row's records for one class of windows, which reach ``ru`` and ``rv``.
 
-    A record serves 2^eu x 2^ev cells; d counts from the middle one, (X - rim_u) 2^eu + 2^eu // 2 along u.
-    The least-squares quadratic of the window, and flatter ones: kept is the one that lies least above
-    the table on average. Slopes are stored in steps of ``unit_g``, curvatures of ``unit_h``.
+    Returns the greatest sum of magnitudes of a record's terms in its window.
+    """
+    most = 0.0
+    for x in range(out.shape[0]):
+        coef, a = room.coef[room.chosen[own, x]], room.constant[own, x]
+        gu, gv, huu, huv, hvv = coef[0, x], coef[1, x], coef[2, x], coef[3, x], coef[4, x]
+        out[x] = pack_quad(int(a), int(gu), int(gv), int(huu), int(huv), int(hvv))
+        slopes = unit_g * (abs(gu) * ru + abs(gv) * rv)
+        bends = unit_h * (abs(huu) * ru * ru + abs(huv) * ru * rv + abs(hvv) * rv * rv)
+        most = max(most, a + slopes + bends)
+    return most
+
+
+@jit
+def quad_tables(
+    wide, middle_u, middle_v, eu, ev, halves, fits, unit_g, unit_h, peak, stretches, sums, room, out
+):
+    """Quadratic majorants: scale leaf[c + d] <= A + g . d + d' h d for d within a window of a record's cells.
+
+    One table (classes, rows, columns) for windows that reach each of ``halves`` (classes, 2) cells to both
+    sides; they grow. A record serves 2^eu x 2^ev cells; d counts from the middle one, which lies ``middle_u``
+    and ``middle_v`` on from the record's first in ``wide`` (2^eu, rows, columns): cell X 2^eu + p of a row is
+    (p, row, X), so that cells of neighbouring records lie side by side. Tried are the least-squares
+    quadratics of the windows ``fits``: kept is what lies least above the table on average; the constant
+    ``peak``, the greatest value, where none will do. Slopes are stored in steps of ``unit_g``, curvatures of
+    ``unit_h``. ``sums`` (fits, 3, rows, columns) and ``room`` are scratch.
+
+    ``stretches`` (n, 4): row, first record, end, end of those after it that are the same as the last one.
 
     Returns the greatest sum of magnitudes of a record's terms anywhere in its window.
     """
-    rows, columns = out.shape
-    height, width = leaf.shape
-    wu, wv = ru + (1 << eu) // 2, rv + (1 << ev) // 2
-    wide = np.zeros((rows * (1 << ev) + 2 * wv, columns * (1 << eu) + 2 * wu), np.float32)
-    y0, x0 = (rim_v << ev) - (1 << ev) // 2 + wv, (rim_u << eu) - (1 << eu) // 2 + wu
-    for i in range(height):
-        for j in range(width):
-            wide[y0 + i, x0 + j] = scale * leaf[i, j]
-    nu, nv = 2 * wu + 1, 2 * wv + 1
-    mu, mv = wu * (wu + 1) / 3.0, wv * (wv + 1) / 3.0  # mean of du^2, dv^2
-    ku, kv = nu * (nu * nu - 1.0) * (nu * nu - 4.0) / 180.0, nv * (nv * nv - 1.0) * (nv * nv - 4.0) / 180.0
-    flat = pack_quad(0, 0, 0, 0, 0, 0)
-    tries = 4 if max(wu, wv) <= MANY_TRIES else 1
-    parts = np.empty((3, wide.shape[0], columns), np.float32)
-    tops = np.empty((wide.shape[0], columns), np.float32)
-    row_sums(wide, wu, eu, columns, parts, tops)
-    sums = np.empty((7, columns), np.float32)
+    for f in range(fits.shape[0]):
+        half = halves[fits[f], 0]
+        row_sums(wide, middle_u - half, half, eu, sums[f])
     most = 0.0
-    for y in range(rows):
-        window_sums(parts, tops, y << ev, wv, sums)
-        for x in range(columns):
-            top = float(sums[6, x])
-            if top == 0.0:
-                out[y, x] = flat
-                continue
-            best, word = top, pack_quad(min(MOST_A, int(np.ceil(top))), 0, 0, 0, 0, 0)
-            peak = top
-            slope_u, slope_v, bend_u, bend_v, twist = 0.0, 0.0, 0.0, 0.0, 0.0
-            if wu > 0:
-                slope_u = sums[1, x] / (nv * nu * mu)
-                bend_u = (sums[3, x] - mu * sums[0, x]) / (nv * ku)
-            if wv > 0:
-                slope_v = sums[2, x] / (nu * nv * mv)
-                bend_v = (sums[5, x] - mv * sums[0, x]) / (nu * kv)
-            if wu > 0 and wv > 0:
-                twist = sums[4, x] / (nu * mu * nv * mv)
-            for f in range(tries):
-                bend = 1.0 - f / 3.0
-                gu, gv = whole(slope_u / unit_g, MOST_G), whole(slope_v / unit_g, MOST_G)
-                huu, hvv = whole(bend * bend_u / unit_h, MOST_H), whole(bend * bend_v / unit_h, MOST_H)
-                huv = whole(bend * twist / unit_h, MOST_H)
-                slopes = unit_g * (abs(gu) * wu + abs(gv) * wv)
-                bends = unit_h * (abs(huu) * wu * wu + abs(huv) * wu * wv + abs(hvv) * wv * wv)
-                # single precision: terms of the sum's magnitude lose a few parts in ten million
-                a = np.ceil(
-                    0.05
-                    + 1e-6 * (top + slopes + bends)
-                    + residual(
-                        wide, y << ev, x << eu, wu, wv, np.float32(gu * unit_g), np.float32(gv * unit_g),
-                        np.float32(huu * unit_h), np.float32(huv * unit_h), np.float32(hvv * unit_h),
-                    )
+    for k in range(stretches.shape[0]):
+        row, begin, end, until = stretches[k]
+        y = (row << ev) + middle_v
+        room.best[:] = np.float32(1e30)
+        room.constant[:] = np.float32(peak)
+        room.chosen[:] = np.int32(fits.shape[0])
+        for f in range(fits.shape[0]):
+            wu, wv = halves[fits[f]]
+            fitted(sums[f, :, :, begin:end], y, wu, wv, unit_g, unit_h, room.sums, room.coef[f])
+            room.residual[:] = np.float32(-1e30)
+            inner_u, inner_v = np.int64(-1), np.int64(-1)
+            for c in range(halves.shape[0]):
+                wu, wv = halves[c]
+                residuals(
+                    wide[:, :, begin:], end - begin, y, eu, middle_u, inner_u, inner_v, wu, wv, unit_g,
+                    unit_h, room.coef[f], room.terms, room.residual,
                 )  # fmt: skip
-                mean = a + unit_h * (huu * mu + hvv * mv)
-                if 0.0 <= a <= MOST_A and mean < best:
-                    best, word = mean, pack_quad(int(a), gu, gv, huu, huv, hvv)
-                    peak = a + slopes + bends
-            out[y, x] = word
-            most = max(most, peak)
+                better(f, end - begin, wu, wv, unit_g, unit_h, c, room)
+                inner_u, inner_v = wu, wv
+        for c in range(halves.shape[0]):
+            wu, wv = halves[c]
+            most = max(most, pack_row(wu, wv, unit_g, unit_h, c, room, out[c, row, begin:end]))
+            out[c, row, end:until] = out[c, row, end - 1]
     return most
 
 

@@ -17,17 +17,17 @@ from bimfit.errors import ConfigError
 from bimfit.geometry.pose import Array
 from bimfit.registration import _kernels_table as _kernels
 from bimfit.registration.lattice import Integers, Lattice
+from bimfit.registration.levels import (
+    MAX_CLASSES,
+    classes_of,
+    first_level,
+    majorant_levels,
+    shared_level,
+    slacks_of,
+)
+from bimfit.registration.majorant import majorant_tables
 
 MAX_CELLS = 1 << 26
-MAX_CLASSES = 6  # slack classes (rings) a level
-QUAD_REACH = 3.2  # widest block that a quadratic serves, in sigma; measured
-QUAD_SLACK = 6.0  # most slack by rotation in a level that has quadratics, in sigma
-QUAD_LOOSE = 2.0  # slack from which on a finer first level, where it is cheap, is better; in sigma, measured
-QUAD_WINDOW = 3.0  # half a window beyond which a quadratic gains nothing over a plain maximum, in sigma
-QUAD_EXACT = 0.35  # half a window within which a quadratic is all but exact, in sigma
-GRAIN = 4.0  # half a block, in a record's cells; measured
-NOMINAL = 160  # points that the first level is chosen for, so that it depends on the lattice alone
-ROOT_COST = 1_200_000.0  # look-ups that bounding the whole first level may cost
 BLUR_REACH = math.sqrt(2.0 * math.log(2.0 * _kernels.FULL)) * 1.0001  # in sigma: farther, a cell holds 0
 
 
@@ -141,18 +141,18 @@ def tables_of_leaf(
     reach: float,
 ) -> Tables:
     """Bounds of every level over any leaf table; ``sigma``: blur in cells of the finer and coarser axis."""
-    slacks = _slacks(lattice, min(lattice.step[:2]), reach)
-    majorant = _majorant_levels(lattice, slacks, sigma[1]) if bound == "majorant" else ()
+    slacks = slacks_of(lattice, min(lattice.step[:2]), reach)
+    majorant = majorant_levels(lattice, slacks, sigma[1]) if bound == "majorant" else ()
     first = first_level(lattice, max(majorant, default=1))
-    shared = _shared_level(lattice, slacks, majorant, sigma[0])
+    shared = shared_level(lattice, slacks, majorant, sigma[0])
     slacks = [slacks[max(h, shared)] if h in majorant else own for h, own in enumerate(slacks)]
-    class_of = _classes(slacks)
+    class_of = classes_of(slacks)
     if bound == "block":
         blocks, block_place = _printed_blocks(leaf, origin, lattice)
     else:
         wanted = {first} | {h - 1 for h in range(2, first + 1) if h not in majorant}
         blocks, block_place = _overlapped_blocks(leaf, lattice, slacks, wanted, first)
-    quads, quad_place, quad_scale = _quads(leaf, lattice, slacks, majorant, shared, sigma[0])
+    quads, quad_place, quad_scale = majorant_tables(leaf, lattice, slacks, majorant, shared, sigma[0])
     angles = lattice.angles
     return Tables(
         lattice, bound, first, origin, leaf, _kernels.lane_table(leaf), blocks, block_place, quads,
@@ -175,68 +175,6 @@ def _leaf(edges: Array, blur: float, cell: Array, half: Array) -> tuple[NDArray[
         np.ascontiguousarray(edges, np.float64), blur, origin[0], origin[1], cell[0], cell[1], height, width
     )
     return table, origin
-
-
-def _classes(slacks: list[Integers]) -> NDArray[np.uint8]:
-    """Which of a level's slack classes serves how many cells of slack, shape (levels, slacks)."""
-    longest = max(int(s[-1]) for s in slacks)
-    out = np.zeros((len(slacks), longest + 1), np.uint8)
-    for level, levels in enumerate(slacks):
-        out[level] = np.minimum(np.searchsorted(levels, np.arange(longest + 1)), len(levels) - 1)
-    return out
-
-
-def _slacks(lattice: Lattice, cell: float, reach: float) -> list[Integers]:
-    """Cells of slack that each of a level's at most six classes provides for, up to a point at ``reach``."""
-    out = []
-    for eta in lattice.half_angle:
-        most = math.ceil(2.0 * reach * math.sin(0.5 * min(eta, math.pi)) / cell + 1e-9) if eta > 0.0 else 0
-        if most < MAX_CLASSES:
-            out.append(np.arange(most + 1))
-        else:
-            out.append(
-                np.unique(np.ceil(most * np.arange(1, MAX_CLASSES + 1) / MAX_CLASSES).astype(np.int64))
-            )
-    return out
-
-
-def _majorant_levels(lattice: Lattice, slacks: list[Integers], sigma: float) -> tuple[int, ...]:
-    """Levels whose nodes are split by quadratic majorants: the fine ones, whose blocks lie within the blur.
-
-    Beyond, a block spans so much of the surface that a quadratic gains nothing over a plain maximum.
-    """
-    widest = lattice.size[:, :2].max(axis=1)
-    levels = [
-        h
-        for h in range(1, lattice.top + 1)
-        if float(widest[h]) <= QUAD_REACH * sigma and float(slacks[h][-1]) <= QUAD_SLACK * sigma
-    ]
-    while len(levels) > 1 and slacks[levels[-1]][-1] > QUAD_LOOSE * sigma and _cheap(lattice, levels[-2]):
-        levels.pop()
-    return tuple(levels)
-
-
-def _shared_level(lattice: Lattice, slacks: list[Integers], levels: tuple[int, ...], sigma: float) -> int:
-    """The coarsest level whose quadratics are all but exact: finer ones look their nodes up in its tables."""
-    fine = [h for h in levels if float(lattice.size[h, :2].max() // 2 + slacks[h][-1]) <= QUAD_EXACT * sigma]
-    return max(fine, default=0)
-
-
-def first_level(lattice: Lattice, lowest: int) -> int:
-    """The level that a search starts on: the finest from ``lowest`` on whose nodes are all cheap to bound."""
-    best = lattice.top
-    for level in range(lattice.top, max(lowest, 1) - 1, -1):
-        if not _cheap(lattice, level):
-            break
-        best = level
-    return best
-
-
-def _cheap(lattice: Lattice, level: int) -> bool:
-    """Whether all nodes of a level may be bounded."""
-    nodes = lattice.nodes[level]
-    nu, nv, nt = (float(x) for x in nodes)
-    return nt * NOMINAL * min(12.0, nv) * (1.0 + nu / 8.0) <= ROOT_COST
 
 
 def _overlapped_blocks(
@@ -298,69 +236,6 @@ def aligned(origin: Array, lattice: Lattice) -> Integers:
     return np.asarray(np.rint(cells), np.int64)
 
 
-def _quads(
-    leaf: NDArray[np.uint8],
-    lattice: Lattice,
-    slacks: list[Integers],
-    levels: tuple[int, ...],
-    shared: int,
-    sigma: float,
-) -> tuple[NDArray[np.uint64], Integers, Array]:
-    height, width = leaf.shape
-    place = np.full((lattice.top + 1, 8), -1, np.int64)
-    scales = np.zeros((lattice.top + 1, 4))
-    parts: list[NDArray[np.uint64]] = []
-    offset, angles = 0, 0
-    steps, unit_g, unit_h = _units(sigma)
-    for level in levels[::-1]:
-        if level < shared:
-            place[level], scales[level] = place[shared], scales[shared]
-            place[level, 7] = angles
-            angles += int(lattice.nodes[level, 2])
-            continue
-        own = slacks[level].tolist()
-        ru, rv = int(lattice.size[level, 0]) // 2, int(lattice.size[level, 1]) // 2
-        eu, ev = (_grain(r + own[-1] // 2) for r in (ru, rv))
-        most_u, most_v = ru + own[-1] + (1 << eu), rv + own[-1] + (1 << ev)
-        rim_u, rim_v = (most_u >> eu) + 1, (most_v >> ev) + 1
-        columns, rows = rim_u + 1 - (-(width + most_u) >> eu), rim_v + 1 - (-(height + most_v) >> ev)
-        place[level] = offset, rows, columns, eu, ev, rim_u << eu, rim_v << ev, angles
-        angles += int(lattice.nodes[level, 2])
-        most = 0.0
-        for slack in own:
-            out = np.empty((rows, columns), np.uint64)
-            if max(ru, rv) + slack > QUAD_WINDOW * sigma:
-                peak = _kernels.FULL * steps
-                _kernels.flat_table(leaf, ru + slack, rv + slack, eu, ev, rim_u, rim_v, steps, out)
-            else:
-                peak = _kernels.quad_table(
-                    leaf, ru + slack, rv + slack, eu, ev, rim_u, rim_v, steps, unit_g, unit_h, out
-                )
-            most = max(most, peak)
-            parts.append(out.ravel())
-            offset += out.size
-        scales[level] = unit_g, unit_h, 1.0 / steps, most / steps
-    return (np.concatenate(parts) if parts else np.zeros(1, np.uint64)), place, scales
-
-
-def _units(sigma: float) -> tuple[float, float, float]:
-    """Steps of a leaf's unit that a constant is held in, and units of slope and curvature in those steps.
-
-    Powers of two, so that what is stored is exact in floating point. Sized for a Gaussian of ``sigma``
-    cells, whose steepest slope is 255 exp(-1/2) / sigma and whose greatest curvature 255 / (2 sigma^2).
-    """
-    steps = 2.0 ** min(7, max(0, math.floor(2.0 * math.log2(max(sigma, 1.0)))))
-    peak = _kernels.FULL * steps
-    slope = 1.1 * peak * math.exp(-0.5) / sigma / _kernels.MOST_G
-    bend = 1.1 * peak / (2.0 * sigma * sigma) / _kernels.MOST_H
-    return steps, 2.0 ** math.ceil(math.log2(slope)), 2.0 ** math.ceil(math.log2(bend))
-
-
-def _grain(radius: int) -> int:
-    """Log2 of the cells a record serves along an axis: about a quarter of the window that it must cover."""
-    return max(0, int(math.log2(max(1.0, radius / GRAIN))))
-
-
 @dataclass(frozen=True, eq=False)
 class Target:
     """A model prepared for matching: its visible surface, its blur, and tables built once for each lattice.
@@ -407,6 +282,14 @@ class Target:
     def empty(self) -> bool:
         """Whether no surface is visible at all."""
         return len(self.edges) == 0
+
+    def cells(self, side_u: float, side_v: float) -> float:
+        """About how many cells of those sides (m) a table of the model has."""
+        if self.empty:
+            return 0.0
+        low_u, low_v, high_u, high_v = self.box
+        rim = 2.0 * BLUR_REACH * self.blur
+        return (high_u - low_u + rim) * (high_v - low_v + rim) / (side_u * side_v)
 
     def reach(self, reach: float) -> None:
         """Let the tables that there are serve points up to ``reach`` (m) from the pivot."""

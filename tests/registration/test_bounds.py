@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from bimfit.config import SearchConfig
 from bimfit.registration import _kernels as kernels
 from bimfit.registration import _kernels_table as table_kernels
-from bimfit.registration import grcsm, table
+from bimfit.registration import grcsm, majorant, table
 from bimfit.registration.lattice import Lattice
 from bimfit.registration.printed import run_brute, run_printed
 
@@ -203,12 +203,20 @@ def test_a_quadratic_lies_above_its_window(seed_, kind, radius, grain, steps, fl
     unit_g, unit_h = 2.0 ** rng.integers(-4, 2), 2.0 ** rng.integers(-6, 2)
     rim_u, rim_v = (ru + (1 << eu) >> eu) + 1, (rv + (1 << ev) >> ev) + 1
     rows, columns = (leaf.shape[0] >> ev) + 2 * rim_v + 2, (leaf.shape[1] >> eu) + 2 * rim_u + 2
-    out = np.empty((rows, columns), np.uint64)
     most = 255.0 * steps
     if flat:
+        out = np.empty((rows, columns), np.uint64)
         table_kernels.flat_table(leaf, ru, rv, eu, ev, rim_u, rim_v, steps, out)
     else:
-        most = table_kernels.quad_table(leaf, ru, rv, eu, ev, rim_u, rim_v, steps, unit_g, unit_h, out)
+        # among the tables of smaller and, outside the rims, of greater windows
+        which, middle = int(rng.integers(0, 3)), np.array([ru + (1 << eu) // 2, rv + (1 << ev) // 2])
+        smaller = np.minimum(middle, rng.integers(0, 3, 2))
+        halves = np.array([*[middle - smaller] * which, middle, middle + rng.integers(0, 3, 2)])
+        blank = table_kernels.pack_quad(0, 0, 0, 0, 0, 0)
+        tables = np.full((len(halves), rows, columns), blank, np.uint64)
+        units = steps, unit_g, unit_h
+        most = majorant.fit_quads(leaf, halves, (eu, ev), (rim_u << eu, rim_v << ev), units, tables)
+        out = tables[which]
     a, gu, gv, huu, huv, hvv = unpacked(out)
     far = 40
     wide = np.pad(leaf.astype(int), far)
