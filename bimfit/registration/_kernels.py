@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bimfit._kernels import jit, jit_inner, jit_inner_fast
+from bimfit._kernels import jit, jit_bare, jit_inner_bare, jit_inner_fast
 from bimfit.registration._kernels_table import FULL, LANE, RIM
 
 LANE_SUM = (1 << LANE) - 1
@@ -36,7 +36,7 @@ DONE, TOLERANCE, BUDGET, HEAP_FULL, FOUND_FULL = 0, 1, 2, 3, 4
 # ---------------------------------------------------------------- cells and leaves
 
 
-@jit_inner
+@jit_inner_bare
 def fill_cells(base, n, cosine, sine, pu, pv, start, cu, cv):
     """Cells of all points at one angle and translation 0, from ``base`` on.
 
@@ -49,7 +49,7 @@ def fill_cells(base, n, cosine, sine, pu, pv, start, cu, cv):
         cv[np.uint64(base + k)] = np.int32(np.floor(b * pu[k] + cosine * pv[k] + start[1]))
 
 
-@jit_inner
+@jit_inner_bare
 def score_box(base, n, cu, cv, weight, chunk, lanes, v0, nv, u0, nu, at, out, to):
     """Scores of nv x nu neighbouring translations at one angle into ``out`` from ``to`` on.
 
@@ -87,13 +87,13 @@ def score_box(base, n, cu, cv, weight, chunk, lanes, v0, nv, u0, nu, at, out, to
 # ---------------------------------------------------------------- heap
 
 
-@jit_inner
+@jit_inner_bare
 def before(ka, ca, kb, cb):
     """Whether entry a leaves the queue before b: greater key, then lesser code."""
     return ka > kb or (ka == kb and ca < cb)
 
 
-@jit_inner
+@jit_inner_bare
 def heap_push(keys, codes, size, key, code):
     """Add an entry to a heap of ``size``."""
     i = size
@@ -106,7 +106,7 @@ def heap_push(keys, codes, size, key, code):
     keys[i], codes[i] = key, code
 
 
-@jit_inner
+@jit_inner_bare
 def heap_pop(keys, codes, size):
     """Remove the first entry of a heap of ``size``; what is left has ``size - 1``."""
     last = size - 1
@@ -128,19 +128,19 @@ def heap_pop(keys, codes, size):
 # ---------------------------------------------------------------- search
 
 
-@jit_inner
+@jit_inner_bare
 def pack(t, v, u):
     """One code for three indices; codes compare lexicographically as (theta, v, u)."""
     return (np.int64(t) << (2 * SHIFT_NODE)) | (np.int64(v) << SHIFT_NODE) | np.int64(u)
 
 
-@jit_inner
+@jit_inner_bare
 def keeps(bound, code, cut, cut_code):
     """Whether a node may hold a leaf that beats the incumbent, ties in lexicographic order."""
     return bound > cut or (bound == cut and code < cut_code)
 
 
-@jit_inner
+@jit_inner_bare
 def ensure_cells(it, n, pu, pv, cosine, sine, start, cu, cv, have):
     """Compute the cells at angle ``it`` unless they are there."""
     if have[it] == 0:
@@ -148,7 +148,7 @@ def ensure_cells(it, n, pu, pv, cosine, sine, start, cu, cv, have):
         have[it] = 1
 
 
-@jit_inner
+@jit_inner_bare
 def merge_blocks(base, n, cu, cv, weight, own, classes, bu, bv, at, lists, counts, slot):
     """Blocks that the points fall into at one (level, angle), neighbours merged; kept in ``lists``.
 
@@ -177,7 +177,7 @@ def merge_blocks(base, n, cu, cv, weight, own, classes, bu, bv, at, lists, count
     counts[slot] = m - first + 1
 
 
-@jit_inner
+@jit_inner_bare
 def bound_box(slot, n, lists, counts, blocks, place, level, v0, nv, u0, nu, tally):
     """Block bounds of nv x nu neighbouring nodes at one (level, angle) into rows of ``tally``.
 
@@ -202,7 +202,7 @@ def bound_box(slot, n, lists, counts, blocks, place, level, v0, nv, u0, nu, tall
                 tally[np.uint64(sums + k)] = np.int32(tally[np.uint64(sums + k)] + step)
 
 
-@jit_inner
+@jit_inner_bare
 def spill(part, stride, nv, nu, root, to):
     """Add the sums of 16 bits to those of 32, and begin anew."""
     for i in range(nv):
@@ -212,7 +212,7 @@ def spill(part, stride, nv, nu, root, to):
         part[np.uint64(k)] = np.uint16(0)
 
 
-@jit_inner
+@jit_inner_bare
 def bound_root(slot, n, lists, counts, blocks, place, level, nv, nu, part, root, to):
     """Block bounds of all nodes at one angle of the first level, from ``to`` on in ``root``.
 
@@ -270,7 +270,7 @@ def point_classes(n, pu, pv, qu, qv, first, eta, class_of, out):
             out[level * n + k] = class_of[level, min(slack, last)]
 
 
-@jit_inner
+@jit_inner_bare
 def turn_classes(first, middle, bt, n, cu, cv, class_of, level, at, own, out):
     """Slack class of every point at one (level, angle) from the cells at the interval's very angles.
 
@@ -405,7 +405,7 @@ def turn_gain(m, base, other, cu, cv, coef, out, i):
     out[3 * i + 2] += t2
 
 
-@jit_inner
+@jit_inner_bare
 def arch(slope, bend, half):
     """Greatest slope x + bend x^2 for |x| <= half."""
     if bend < 0.0 and abs(slope) < -2.0 * bend * half:
@@ -413,7 +413,7 @@ def arch(slope, bend, half):
     return abs(slope) * half + bend * half * half
 
 
-@jit_inner
+@jit_inner_bare
 def quad_node(
     n, first, middle, bt, du, dv, cu, cv, own, classes, heft, where, unit, level, quads, at, words, halves,
     coef,
@@ -438,7 +438,7 @@ def quad_node(
                 turn_gain(m, base, (first + i) * n + k, cu, cv, coef, turns, i)
 
 
-@jit_inner
+@jit_inner_bare
 def quad_children(size, level, sums, turns, scale, margin, cut, out):
     """Bounds of all children (theta, v, u) of a node; NOTHING for those seen to lie under ``cut``.
 
@@ -476,13 +476,13 @@ def quad_children(size, level, sums, turns, scale, margin, cut, out):
                     out[at] = max(out[at], np.int64(np.floor(value * scale + margin)))
 
 
-@jit_inner
+@jit_inner_bare
 def log_prior(prior, prior_at, level, t, v, u):
     """Log-prior of one node of a level, or of one leaf (level 0)."""
     return prior[prior_at[level, 2] + t] + prior[prior_at[level, 1] + v] + prior[prior_at[level, 0] + u]
 
 
-@jit_inner
+@jit_inner_bare
 def list_blocks(
     level, t, n, pu, pv, weight, start, cosine, sine, size, classes, slots, cu, cv, have, lists, list_counts,
     at,
@@ -500,18 +500,17 @@ def list_blocks(
     return slot
 
 
-@jit
+@jit_bare
 def search(
     options, pu, pv, weight, heft, start, cosine, sine, size, count, lanes, blocks, place, quads, quad_place,
     quad_scale, class_of, classes, slots, prior, prior_at, cu, cv, have, lists, list_counts, near, near_have,
-    at, words, halves, coef, tally, part, box, root, crest, keys, codes, found_codes, found_scores, state,
+    at, words, halves, coef, sums, turns, tally, part, box, root, crest, keys, codes, found_codes,
+    found_scores, state,
 ):  # fmt: skip
     """Best-first branch and bound over (theta, v, u); resumable, see ``grcsm.py`` for the arguments."""
-    n, first, top = options[0], options[1], options[2]
+    n, first = options[0], options[1]
     chunk, limit, slice_limit = options[3], options[4], options[5]
     collect, floor_score, has_prior, total = options[6], options[7], options[8], options[9]
-    sums = np.empty(6)
-    turns = np.empty(3 * size[top, 2] if quads.shape[0] > 1 else 3)
     n_heap, cut, cut_code = state[HEAP], state[BEST], state[BEST_CODE]
     evaluations, n_found = state[EVALUATIONS], state[FOUND]
     started = evaluations
@@ -767,8 +766,8 @@ def match_run(
     half_angle,
     lanes, blocks, place, quads, quad_place, quad_scale, class_of, slots, prior, prior_at, pu, pv, weight,
     heft,
-    classes, cu, cv, have, lists, list_counts, near, near_have, at, words, halves, coef, tally, part, box,
-    root, crest, keys, codes, found_codes, found_scores, state, ints, reals,
+    classes, cu, cv, have, lists, list_counts, near, near_have, at, words, halves, coef, sums, turns, tally,
+    part, box, root, crest, keys, codes, found_codes, found_scores, state, ints, reals,
 ):  # fmt: skip
     """Match slices one after the other from ``begin`` on; the first that was not done.
 
@@ -827,9 +826,8 @@ def match_run(
             options, pu[:n], pv[:n], weight[:n], heft[:n], start, cosine, sine, size, count, lanes, blocks,
             place,
             quads, quad_place, quad_scale, class_of, classes, slots, prior, prior_at, cu, cv, have, lists,
-            list_counts, near, near_have, at, words, halves, coef, tally, part, box, root, crest, keys, codes,
-            found_codes,
-            found_scores, state,
+            list_counts, near, near_have, at, words, halves, coef, sums, turns, tally, part, box, root, crest,
+            keys, codes, found_codes, found_scores, state,
         )  # fmt: skip
         ints[i, HOW] = ended
         if ended == HEAP_FULL:

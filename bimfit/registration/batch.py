@@ -109,8 +109,7 @@ def _search(
             hints[i] = pose.u, pose.v, pose.theta
     ints, reals = np.zeros((count, 6), np.int64), np.zeros((count, 5))
     longest = max(map(len, slices))
-    begin = 0
-    reach = 0.0 if target.has_tables(lattice, bound) else _reach(target, slices, motions, lattice)
+    begin, reach = 0, 0.0
     prior, prior_at, has_prior = grcsm.prior_table(config, lattice, unit)
     limit = config.max_evaluations if config.max_evaluations is not None else 1 << 60
     while begin < count:
@@ -119,32 +118,20 @@ def _search(
         options = np.array(
             [0, plan.first, lattice.top, 0, limit, 1 << 60, 0, 0, has_prior, 0, plan.lowest], np.int64
         )
+        # only the slice that asked for them has the tables that reach farther
+        end = begin + 1 if reach > 0.0 else count
         begin = kernels.match_run(
-            begin, points, ends, motions, weights, hints, _frame(target, tables, config), target.edges,
+            begin, points, ends[:end], motions, weights, hints, _frame(target, tables, config), target.edges,
             options, tables.step, tables.cosine, tables.sine, lattice.size, lattice.nodes, plan.half_angle,
             *tables.arrays, plan.slots, prior, prior_at, *work.arrays, ints, reals,
         )  # fmt: skip
-        if begin < count:
-            reach = float(reals[begin, kernels.REACH])
+        reach = 0.0
+        if begin < end:
             if ints[begin, kernels.HOW] == kernels.HEAP_FULL:
                 work.grow("keys", "codes")
+            if reals[begin, kernels.REACH] > target.tables(lattice, bound, 0.0).reach:
+                reach = float(reals[begin, kernels.REACH])
     return [_found(a, b, lattice) for a, b in zip(ints.tolist(), reals.tolist(), strict=True)]
-
-
-def _reach(target: Target, slices: Sequence[Array], motions: Array, lattice: Lattice) -> float:
-    """Largest distance from its pivot of any slice's point, m: what the first tables must provide for."""
-    frame, step, none = np.array(_near(target, lattice)), lattice.step, np.zeros(0, np.uint64)
-    most = 0.0
-    for points, motion in zip(slices, motions, strict=True):
-        n = len(points)
-        scratch = np.empty(n), np.empty(n), np.empty(n, np.uint64), np.empty(n, np.float32)
-        out = np.empty(4)
-        kernels.prepare(
-            points, motion, frame[:4], frame[4], frame[5], 1.0 / step[0], 1.0 / step[1], none, *scratch, out
-        )
-        if out[3] >= grcsm.MIN_POINTS:
-            most = max(most, float(out[2]))
-    return most
 
 
 def _near(target: Target, lattice: Lattice) -> tuple[float, ...]:

@@ -238,6 +238,7 @@ class Workspace:
         self.words = np.empty(kernels.RUN, np.uint64)
         self.halves = self.words.view(np.int32)
         self.coef = np.empty(5 * kernels.RUN, np.float32)
+        self.sums, self.turns = np.empty(6), np.empty(3 * int(lattice.size[lattice.top, 2]))
         self.box = np.empty(max(wide, plan.fan), np.int64)
         self.tally = np.empty(plan.tally, np.int32)
         self.part = np.empty(plan.part, np.uint16)
@@ -253,8 +254,8 @@ class Workspace:
         """What ``search`` scribbles on, in its order."""
         return (
             self.cu, self.cv, self.have, self.lists, self.list_counts, self.near, self.near_have, self.at,
-            self.words, self.halves, self.coef, self.tally, self.part, self.box, self.root, self.crest,
-            self.keys, self.codes, self.found, self.values,
+            self.words, self.halves, self.coef, self.sums, self.turns, self.tally, self.part, self.box,
+            self.root, self.crest, self.keys, self.codes, self.found, self.values,
         )  # fmt: skip
 
     @cached_property

@@ -292,25 +292,30 @@ class Target:
         return (high_u - low_u + rim) * (high_v - low_v + rim) / (side_u * side_v)
 
     def reach(self, reach: float) -> None:
-        """Let the tables that there are serve points up to ``reach`` (m) from the pivot."""
+        """Build what points up to ``reach`` (m) from the pivot will need, for every lattice known so far."""
         for key, found in list(self.kept.items()):
             if isinstance(found, Tables):
-                lattice, bound = key
+                lattice, bound, _ = key
                 self.tables(lattice, bound, reach)
 
-    def has_tables(self, lattice: Lattice, bound: Bound) -> bool:
-        """Whether some tables for a lattice are there already."""
-        return (lattice, bound) in self.kept
-
     def tables(self, lattice: Lattice, bound: Bound, reach: float) -> Tables:
-        """Tables for a lattice and for points up to ``reach`` (m) from the pivot; built once and kept."""
-        key = (lattice, bound)
+        """Tables for a lattice and for points up to ``reach`` (m) from the pivot; built once and kept.
+
+        They reach as far as the model itself, or a power of 1.5 farther: a slice is given the same ones
+        whatever was searched before it.
+        """
+        low_u, low_v, high_u, high_v = self.box
+        own = 0.5 * math.hypot(high_u - low_u, high_v - low_v)
+        steps = 0
+        while own * 1.5**steps < reach and own > 0.0:
+            steps += 1
+        key = (lattice, bound, steps if own > 0.0 else reach)
         found: Tables | None = self.kept.get(key)
-        if found is not None and found.reach >= reach:
-            return found
-        with self.lock:
-            found = self.kept.get(key)
-            if found is None or found.reach < reach:
-                found = build_tables(self.edges, self.blur, lattice, bound, 1.25 * reach)
-                self.kept[key] = found
+        if found is None:
+            with self.lock:
+                found = self.kept.get(key)
+                if found is None:
+                    farthest = own * 1.5**steps if own > 0.0 else reach
+                    found = build_tables(self.edges, self.blur, lattice, bound, farthest)
+                    self.kept[key] = found
         return found
