@@ -21,6 +21,8 @@ from bimfit.geometry.pose import Array
 
 _LOST = 3
 """So many lost beams in a row are looked at."""
+_LEAST, _GREATEST = 1e-4, 0.4
+"""Bounds of the share of lost beams."""
 _ANOTHER = 0.010
 """A place that far away, or most of a gap, may be another gap, m."""
 
@@ -40,6 +42,7 @@ def disagreements(
         Where along the joint a kinked motion bends, m; empty for other motions.
     """
     distances = [fit.distance.copy() for fit in fits]
+    share = _lost_share(stations)
     for sites, fit, distance, sign in zip(parts, fits, distances, (-1.0, 1.0), strict=True):
         far = np.flatnonzero(distance > FLAG)
         if not len(far):
@@ -47,8 +50,6 @@ def disagreements(
         e, spread = left_out(sites, fit.weight, fit.value, fit.covariance)
         for i in far.tolist():
             step = sign * _beam_width(stations[i], sections[i], parts, i)
-            sensor = stations[i].sensor
-            share = min(sensor.miss_share + sensor.outlier_share, 0.4)
             distance[i] = _with_lost_beams(e[i], spread[i], step, share)
     for i in _alone(parts[0].s, knots):
         width = float(np.hypot(*(sections[i].gap.mouth[1] - sections[i].gap.mouth[0])))
@@ -61,6 +62,20 @@ def disagreements(
             distance[i] = max(distance[i], d)
     a, b = (replace(fit, distance=d) for fit, d in zip(fits, distances, strict=True))
     return a, b
+
+
+def _lost_share(stations: Sequence[StationEstimate]) -> float:
+    """Share of beams that should meet a component and do not return from it, as the joint shows it.
+
+    The sensor's own shares, which are never under 0.01 each, count as one beam's: at their price a jump by a
+    beam's width could always be a lost beam.
+    """
+    lost, covered = max((e.sensor.miss_share + e.sensor.outlier_share for e in stations), default=0.0), 1.0
+    for c in (c for station in stations for c in station.components if c.status.measured):
+        r = c.residuals
+        lost += (r.miss_share + r.outlier_share) * r.n_covered
+        covered += r.n_covered
+    return min(max(lost / covered, _LEAST), _GREATEST)
 
 
 def _with_lost_beams(e: Array, spread: Array, step: float, share: float) -> float:
@@ -76,7 +91,7 @@ def _with_lost_beams(e: Array, spread: Array, step: float, share: float) -> floa
         Of beams that are lost: k of them in a row have a probability of share^k.
     """
     inverse = np.linalg.inv(spread)
-    price = 2.0 * math.log((1.0 - share) / max(share, 1e-3))
+    price = 2.0 * math.log((1.0 - share) / share)
     best = float(e @ inverse @ e)
     for k in range(1, _LOST + 1 if step != 0.0 else 1):
         rest = e - np.array([k * step, 0.0, 0.0])
