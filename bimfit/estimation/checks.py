@@ -19,7 +19,7 @@ _RIVAL_ODDS = -4.0
 _RIVAL_MASS = 0.2
 _WORTH_NAMING = 0.01
 _INLIERS = 0.5
-_DOZEN = 12
+DOZEN = 12
 """So few returns fix a pose, but cannot show that it is the right component (METHOD, section 8)."""
 _RUN = 6
 _CUSUM = 2.3
@@ -143,7 +143,7 @@ def _component_status(
     if moved > 2.5 * window.shift or turned > _TURNED * window.angle:
         where = f"{moved * 1e3:.0f} mm and {math.degrees(turned):.1f} degrees from the joint's common pose"
         return Status("rejected", f"it lies {where}, more than the placement tolerance allows"), ""
-    if r.n_inliers <= _DOZEN:
+    if r.n_inliers <= DOZEN:
         return Status("weak", f"only {r.n_inliers} returns support it: too few to tell its shape"), ""
     if posterior.weak_sd > FIXED * window.shift:
         weak = _direction(posterior.weak_axis)

@@ -14,6 +14,7 @@ from bimfit.estimation import _kernels_knots as kernels
 from bimfit.estimation import trend
 from bimfit.estimation.borrow import FLAG, SHAKES, at_corner, at_corners, borrow
 from bimfit.estimation.cells import SharedCells, shared_cells, with_shared_cells
+from bimfit.estimation.checks import DOZEN
 from bimfit.estimation.disagreement import disagreements
 from bimfit.estimation.pooled import pooled
 from bimfit.estimation.result import ComponentEstimate, StationEstimate
@@ -201,10 +202,11 @@ def _mostly_sound(stations: Sequence[StationEstimate]) -> bool:
 
 
 def _fixed(station: StationEstimate) -> bool:
-    if station.status.name == "ok":
-        return True
-    free = any(c.weak_direction for c in station.components)
-    return station.status.name == "weak" and station.through > 0 and not station.virtual and not free
+    """Whether nothing but the shape of a component is in doubt, if anything is."""
+    doubted = [c for c in station.components if c.status.name != "ok"]
+    if station.status.name != "weak" or not doubted or station.through == 0 or station.virtual:
+        return station.status.name == "ok"
+    return all(c.status.name == "weak" and not c.weak_direction and c.n_inliers > DOZEN for c in doubted)
 
 
 def _fit_pair(parts: tuple[Sites, Sites], bases: tuple[Basis, Basis]) -> tuple[Trend, Trend]:

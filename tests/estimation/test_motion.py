@@ -147,6 +147,27 @@ def test_where_most_stations_are_weak_each_stays_as_it_is():
     assert estimate_joint(stations, _sections(), "linear").model == "linear"
 
 
+@pytest.mark.parametrize(("returns", "model"), [(60, "linear"), (10, "independent")])
+def test_doubt_about_a_shape_alone_leaves_the_motion_a_model(returns, model):
+    rng = np.random.default_rng(6)
+    doubt = Status("weak", "its surface is bent")
+    stations = [
+        dataclasses.replace(
+            e,
+            status=doubt,
+            through=14,
+            components=(
+                dataclasses.replace(e.components[0], status=doubt, n_inliers=returns),
+                e.components[1],
+            ),
+        )
+        for e in _stations(rng, _truth("linear", rng))
+    ]
+    result = estimate_joint(stations, _sections(), "auto")
+    assert result.model == model
+    assert all(e.status == doubt for e in result.stations)
+
+
 def test_a_station_off_by_what_chance_explains_is_flagged_but_follows_the_joint():
     rng = np.random.default_rng(5)
     truth = _truth("linear", rng)
