@@ -87,7 +87,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words
     no_cache = "--no-cache" in words
-    words = [word for word in words if word not in ("--debug", "--no-cache")]
+    words = [word for word in words if word not in ("--debug", "--no-cache")] or ["--help"]
     try:
         with termination_raises(), _without_cache() if no_cache else contextlib.nullcontext():
             status = app(words, prog_name="bimfit", standalone_mode=False)
@@ -106,7 +106,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _refuse(f"{what}: {error.strerror or error}", debug)
     except Exception as error:
         if hasattr(error, "format_message"):  # a usage error of typer's
-            return _refuse(f"{error.format_message()} Try: bimfit --help", debug)
+            return _refuse(f"{error.format_message().rstrip('.')}; try bimfit --help", debug)
         line = f"internal error ({type(error).__name__}: {error}); please report it with what --debug shows"
         return _refuse(line, debug)
     if status == INTERRUPTED:  # typer takes Ctrl-C for itself

@@ -315,6 +315,14 @@ def says(line, *named) -> bool:
     return all(str(name) in line for name in named)
 
 
+def test_a_program_named_alone_shows_its_help(capsys):
+    assert main([]) == 0
+    alone = capsys.readouterr().out
+    assert main(["--help"]) == 0
+    assert alone == capsys.readouterr().out
+    assert len(alone.splitlines()) > 20
+
+
 def test_not_an_ifc(scan, tmp_path, capsys):
     wrong = tmp_path / "wrong.ifc"
     wrong.write_text("this is not a model\n")

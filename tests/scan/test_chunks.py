@@ -158,13 +158,14 @@ def test_las_pieces_leave_out_what_no_box_holds(tmp_path, monkeypatch, suffix: s
     assert sum(map(len, scan_chunks(path, ReadOptions(boxes=nowhere.array)))) == 0
 
 
-def test_a_file_cut_short_is_told_after_its_pieces(tmp_path) -> None:
+def test_a_file_cut_short_is_told(tmp_path) -> None:
     path = tmp_path / "cloud.las"
     write_las(cloud(1000), path)
     path.write_bytes(path.read_bytes()[:-400])
     boxes = Boxes.of(np.array([[[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]]))
     for wanted in (None, boxes.array):
-        with pytest.raises(ScanError, match=r"cut short|damaged"):
+        # a record of point format 0 has 20 bytes
+        with pytest.raises(ScanError, match=r"cut short: 980 of 1,000 points; .*again"):
             list(scan_chunks(path, ReadOptions(boxes=wanted)))
     with pytest.raises(ScanError, match="unit"):
         next(scan_chunks(path, ReadOptions(-1.0)))

@@ -49,7 +49,15 @@ def _check(path: Path, stream: BinaryIO, head: bytes, size: int) -> None:
     further = struct.unpack_from("<I", head, 243)[0] if later else 0
     if records * _RECORD + further * _LONG_RECORD > size or points > size:
         raise ScanError("not a LAS file, or damaged: more records than it has room for", file=path)
-    if head[104] & _PACKED:
+    if not head[104] & _PACKED:
+        length, old = struct.unpack_from("<HI", head, 105)
+        count = struct.unpack_from("<Q", head, 247)[0] if later else old
+        room = (size - points) // max(length, 1)
+        if room < count:
+            raise ScanError(
+                f"cut short: {room:,} of {count:,} points", file=path, remedy="copy or export it again"
+            )
+    else:
         stream.seek(begin)
         packing = _packing(stream, records)
         if packing is None:
