@@ -21,6 +21,7 @@ _MATTERS = 0.06
 _BEND_MATTERS = 0.02
 """A bend, by this: what shows of one is what no turn of the component takes up."""
 _NEIGHBOURS, _MOSTLY = 6, 0.6
+_SPEAKS = 0.3
 
 
 def with_company(
@@ -35,7 +36,9 @@ def with_company(
     correlation : float
         Of neighbouring beams' noise.
     """
-    departures = [departure(stations, sections, which, correlation=correlation) for which in (0, 1)]
+    trusted = _trusted(stations)
+    pooled = [stations[i] for i in trusted], [sections[i] for i in trusted]
+    departures = [departure(*pooled, which, correlation=correlation) for which in (0, 1)]
     sigma = min((e.sensor.sigma for e in stations), default=0.0)
     together = math.hypot(*(d.bow for d in departures)) > _BOTH
     reasons = [_reason(d, sigma, _TAKES_PART if together else _BENT) for d in departures]
@@ -52,6 +55,15 @@ def with_company(
             continue
         out.append(_with_shape(station, reasons))
     return tuple(out)
+
+
+def _trusted(stations: Sequence[StationEstimate]) -> list[int]:
+    """Stations whose residuals speak of the components: all, or only those that are ``ok`` if that is many.
+
+    Where a part of a joint is filled or covered, returns from something else lie beside its components.
+    """
+    fine = [i for i, e in enumerate(stations) if e.status.name == "ok"]
+    return fine if len(fine) >= _SPEAKS * len(stations) else list(range(len(stations)))
 
 
 def departs(found: Departure, bent: float = _SURE) -> bool:
