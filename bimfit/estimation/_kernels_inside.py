@@ -40,6 +40,66 @@ def distance(x: float, y: float, chain: Array) -> float:
 
 
 @jit
+def returns_between(
+    side_a: Array, side_b: Array, poses: Array, spread: Array, rays: Array, r: Array, start: Ints, eye: Array,
+    spacing: float, sweeps: int, sure: float,
+) -> tuple[Array, float]:  # fmt: skip
+    """Beams that end between the sides of a gap and clear of them, (m, 4): origin and end; and their step, m.
+
+    What lies on a side itself, deep in the gap where a beam grazes it, is the component: so many of its
+    deviations, and a beam's step, a return must be away from it.
+
+    Parameters
+    ----------
+    side_a, side_b : (k, 2)
+        The components' sides of the gap as designed, from the mouth on.
+    poses, spread : (2, 3) and (2,)
+        Where the components are, and how well their places across the gap are known, m.
+    spacing, sweeps : float, int
+        Usual angle between neighbouring beams, rad, and how many sweeps share the slice.
+    """
+    a, b = _moved(side_a, poses[0]), _moved(side_b, poses[1])
+    index, ends = returns_within(np.concatenate((a, b[::-1])), rays, r, start, eye)
+    if index.shape[0] == 0:
+        return ends, 0.0
+    step = _beam_step(rays, start, eye, float(np.median(r[index])), spacing, sweeps)
+    count = 0
+    for k in range(ends.shape[0]):
+        x, y = ends[k, 2], ends[k, 3]
+        if distance(x, y, a) > sure * spread[0] + step and distance(x, y, b) > sure * spread[1] + step:
+            ends[count] = ends[k]
+            count += 1
+    return ends[:count], step
+
+
+@jit
+def _moved(chain: Array, pose: Array) -> Array:
+    """A chain (k, 2) at a pose."""
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    out = np.empty((chain.shape[0], 2))
+    for i in range(chain.shape[0]):
+        out[i, 0] = cos * chain[i, 0] - sin * chain[i, 1] + pose[0]
+        out[i, 1] = sin * chain[i, 0] + cos * chain[i, 1] + pose[1]
+    return out
+
+
+@jit
+def _beam_step(rays: Array, start: Ints, eye: Array, reach: float, spacing: float, sweeps: int) -> float:
+    """How far apart the beams of one sweep are at a distance, m, however many sweeps interleave."""
+    n = rays.shape[1]
+    if sweeps <= 1:
+        return spacing * reach
+    mx, my = rays[1].mean(), rays[2].mean()
+    low, high, size = np.inf, -np.inf, max(math.hypot(mx, my), 1e-9)
+    for g in range(eye.shape[0]):
+        for k in range(start[g], start[g + 1]):
+            x, y = eye[g, 0] + reach * rays[1, k], eye[g, 1] + reach * rays[2, k]
+            aside = (y * mx - x * my) / size
+            low, high = min(low, aside), max(high, aside)
+    return max(spacing * reach, (high - low) / max(n / sweeps - 1.0, 1.0))
+
+
+@jit
 def returns_within(ring: Array, rays: Array, r: Array, start: Ints, eye: Array) -> tuple[Ints, Array]:
     """Beams that end inside a ring: their indices, and where (m, 4): origin and end."""
     index, ends = np.empty(r.shape[0], np.int64), np.empty((r.shape[0], 4))
@@ -79,16 +139,7 @@ def _meets(edges: Array, pose: Array, ox: float, oy: float, dx: float, dy: float
 
 
 @jit
-def loose(
-    ends: Array,
-    edges_a: Array,
-    edges_b: Array,
-    poses: Array,
-    side_a: Array,
-    side_b: Array,
-    beyond: float,
-    clear: Array,
-) -> int:
+def loose(ends: Array, edges_a: Array, edges_b: Array, poses: Array, beyond: float) -> int:
     """How many returns come from where neither component is.
 
     Parameters
@@ -99,19 +150,13 @@ def loose(
         As designed.
     poses : (2, 2, 3)
         For each component the poses that it is tried at.
-    side_a, side_b : (k, 2)
-        The sides of the gap, where they are.
     beyond : float
         So much further than the return the components must lie, m.
-    clear : (2,)
-        So far from the sides the return must be, m.
     """
     count = 0
     for k in range(ends.shape[0]):
         ox, oy, x, y = ends[k]
         r = math.hypot(x - ox, y - oy)
-        if distance(x, y, side_a) <= clear[0] or distance(x, y, side_b) <= clear[1]:
-            continue
         dx, dy = (x - ox) / r, (y - oy) / r
         least = np.inf
         for i in range(2):

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from bimfit.config import FitConfig, SensorConfig
+from bimfit.estimation.context import Context
 from bimfit.estimation.posterior import Posterior, Window
 from bimfit.estimation.result import ComponentEstimate, Residuals, Rival, StationEstimate
 from bimfit.estimation.slide import SlideResult
@@ -35,47 +36,39 @@ _ON_CHAIN = 1e-6
 
 
 def judge_station(
-    s: float,
-    section: JointSection,
+    context: Context,
     slid: SlideResult,
     posteriors: tuple[Posterior | None, Posterior | None],
     residuals: tuple[Residuals, Residuals],
     steps: tuple[float, float],
-    window: Window,
-    sensor: SensorConfig,
-    fit: FitConfig,
     passed: int,
-    reason: str,
-    virtual: bool,
-    growth: float,
 ) -> StationEstimate:
-    """Put a station together and say what may be believed of it."""
-    made = [
-        replace(_component(section, which, p, r, slid.pose, window, sensor, fit), corner_step=step)
-        for which, (p, r, step) in enumerate(zip(posteriors, residuals, steps, strict=True))
-    ]
-    components = (made[0], made[1])
-    covered = sum(r.n_covered for r in residuals)
-    status = _joint_status(section, components, slid.pose, fit, passed, steps, sensor, covered)
-    for name, c in zip("AB", components, strict=True):
+    """Put a station together and say what may be believed of it.
+
+    Parameters
+    ----------
+    steps : tuple of two float
+        Bearings of the mouth corners in beam steps.
+    passed : int
+        Beams that went in between the components.
+    """
+    a, b = (
+        _component(context, which, posteriors[which], residuals[which], slid.pose, steps[which])
+        for which in (0, 1)
+    )
+    covered = residuals[0].n_covered + residuals[1].n_covered
+    status = _joint_status(context, (a, b), slid.pose, passed, covered)
+    for name, c in (("A", a), ("B", b)):
         worse = status.measured if not c.status.measured else status.name == "ok"
         if c.status.name != "ok" and worse:
             status = Status(c.status.name, f"component {name}: {c.status.reason}")
     loose = [p is None or p.weak_sd_ranges > _FIXED_BY_HITS for p in posteriors]
-    if status.name == "ok" and reason and any(loose):
-        status = Status("weak", f"not fixed across the gap (u): {reason}")
+    if status.name == "ok" and context.reason and any(loose):
+        status = Status("weak", f"not fixed across the gap (u): {context.reason}")
     return StationEstimate(
-        s,
-        slid.pose,
-        (components[0], components[1]),
-        status,
-        sensor,
-        slid.shift,
-        slid.rival_odds,
-        passed,
-        virtual,
-        growth,
-    )
+        context.slice.s, slid.pose, (a, b), status, context.sensor, slid.shift, slid.rival_odds, passed,
+        context.virtual, context.growth,
+    )  # fmt: skip
 
 
 def with_rival(station: StationEstimate, odds: float) -> StationEstimate:
@@ -89,16 +82,24 @@ def with_rival(station: StationEstimate, odds: float) -> StationEstimate:
 
 
 def _component(
-    section: JointSection, which: int, posterior: Posterior | None, residuals: Residuals, prior: Pose2D,
-    window: Window, sensor: SensorConfig, fit: FitConfig,
-) -> ComponentEstimate:  # fmt: skip
+    context: Context,
+    which: int,
+    posterior: Posterior | None,
+    residuals: Residuals,
+    prior: Pose2D,
+    step: float,
+) -> ComponentEstimate:
+    """What is known of one component, and whether it may be believed."""
     if posterior is None:
-        return ComponentEstimate(status=Status("no_data", "hardly any return lies on the component"))
-    status, weak = _component_status(posterior, residuals, prior, window, fit, sensor)
+        none = Status("no_data", "hardly any return lies on the component")
+        return ComponentEstimate(status=none, corner_step=step)
+    window = context.window
+    status, weak = _component_status(posterior, residuals, prior, window, context.fit, context.sensor)
     if status.name == "ok" and residuals.unsupported is not None:
         face = residuals.unsupported
         weak = _direction(face.direction)
-        where = f"return from {_face_name(section, which, face.face)}, without which nothing fixes it {weak}"
+        name = _face_name(context.section, which, face.face)
+        where = f"return from {name}, without which nothing fixes it {weak}"
         status = Status("weak", f"only {face.inliers} of {face.beams} beams {where}")
     rivals: tuple[Rival, ...] = ()
     if posterior.rival_mass > _WORTH_NAMING:
@@ -108,7 +109,7 @@ def _component(
         rivals = (Rival(there, math.log(mass / (1.0 - mass))),)
     return ComponentEstimate(
         posterior.pose, posterior.covariance, status, rivals, residuals.n_inliers, residuals.rms, weak,
-        posterior, residuals, prior, (window.shift, window.shift, window.angle),
+        posterior, residuals, prior, (window.shift, window.shift, window.angle), step,
     )  # fmt: skip
 
 
@@ -116,8 +117,9 @@ def _component_status(
     posterior: Posterior, r: Residuals, prior: Pose2D, window: Window, fit: FitConfig, sensor: SensorConfig
 ) -> tuple[Status, str]:
     """Verdict on one component, and the name of its weak direction."""
-    pivot = posterior.pivot
-    moved = float(np.hypot(*(posterior.pose.apply(prior.inverse().apply(pivot)) - pivot)))
+    u, v = posterior.pivot.tolist()
+    there = posterior.pose.point(*prior.inverse().point(u, v))
+    moved = math.hypot(there[0] - u, there[1] - v)
     turned = abs(posterior.pose.theta - prior.theta)
     if r.n_inliers < fit.min_points:
         lie = "return lies" if r.n_inliers == 1 else "returns lie"
@@ -156,27 +158,23 @@ def _component_status(
 
 
 def _joint_status(
-    section: JointSection,
-    components: tuple[ComponentEstimate, ...],
+    context: Context,
+    components: tuple[ComponentEstimate, ComponentEstimate],
     pose: Pose2D,
-    fit: FitConfig,
     passed: int,
-    steps: tuple[float, float],
-    sensor: SensorConfig,
     covered: int,
 ) -> Status:
     """Verdict on the two components together: whether there is a gap, and whether it can be this one."""
     a, b = components
     if a.pose is None or b.pose is None:
         return OK
-    designed = section.gap.mouth[1] - section.gap.mouth[0]
-    now = b.pose.apply(section.gap.mouth[1]) - a.pose.apply(section.gap.mouth[0])
-    across = designed / max(float(np.hypot(*designed)), 1e-9)
-    widened = float(pose.turn(across) @ now) - float(np.hypot(*designed))
+    fit, sensor, width = context.fit, context.sensor, context.section.gap.width
+    widened = _widened(context.section, a.pose, b.pose, pose)
     if abs(widened) > 2.0 * fit.placement_tolerance:
         how = "wider" if widened > 0.0 else "narrower"
         return Status("rejected", f"the gap would be {abs(widened) * 1e3:.0f} mm {how} than designed")
-    beams = abs(steps[1] - steps[0]) if all(math.isfinite(x) for x in steps) else 0.0
+    beams = abs(b.corner_step - a.corner_step)
+    beams = beams if math.isfinite(beams) else 0.0
     if beams < 1.0 and passed == 0:
         return Status(
             "weak", "no beam passes between the components: the gap is narrower than the beams' spacing"
@@ -188,12 +186,23 @@ def _joint_status(
     if passed == 0:
         return Status("weak", "no beam passes between the components: closed, filled, or not a gap at all")
     # a gap that would be far narrower than designed is the more likely one that chance misses have made
-    doubt = _BY_CHANCE if widened > -0.5 * float(np.hypot(*designed)) else 0.1 * _BY_CHANCE
+    doubt = _BY_CHANCE if widened > -0.5 * width else 0.1 * _BY_CHANCE
     chance = max(sensor.outlier_share if silent else sensor.miss_share, 1e-3)
     if passed and covered * chance**passed > doubt:
         beams_pass = "1 beam passes" if passed == 1 else f"{passed} beams pass"
         return Status("weak", f"only {beams_pass} between the components: too few to tell from drop-outs")
     return OK
+
+
+def _widened(section: JointSection, a: Pose2D, b: Pose2D, pose: Pose2D) -> float:
+    """How much wider than designed the mouth is along the designed line from corner to corner, m."""
+    (au, av), (bu, bv) = section.gap.corners.tolist()
+    width = section.gap.width
+    c, s = math.cos(pose.theta), math.sin(pose.theta)
+    across = (bu - au) / max(width, 1e-9), (bv - av) / max(width, 1e-9)
+    (x0, y0), (x1, y1) = a.point(au, av), b.point(bu, bv)
+    along = (c * across[0] - s * across[1]) * (x1 - x0) + (s * across[0] + c * across[1]) * (y1 - y0)
+    return along - width
 
 
 def _direction(axis: Array) -> str:

@@ -48,10 +48,8 @@ def components_at(
     residuals = [_residuals(context, which, views, sight, p) for which, p in enumerate((a, b))]
     steps = [_corner_step(context, which, p) for which, p in enumerate(_poses((a, b), pose))]
     return checks.judge_station(
-        context.slice.s, context.section, slid, (a, b), (residuals[0], residuals[1]), (steps[0], steps[1]),
-        context.window, context.sensor, context.fit, views.passed, context.reason, context.virtual,
-        context.growth,
-    )  # fmt: skip
+        context, slid, (a, b), (residuals[0], residuals[1]), (steps[0], steps[1]), views.passed
+    )
 
 
 def _poses(posteriors: Pair, pose: Pose2D) -> tuple[Pose2D, Pose2D]:

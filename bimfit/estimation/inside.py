@@ -9,7 +9,7 @@ import numpy as np
 
 from bimfit.estimation import _kernels_inside as kernels
 from bimfit.estimation.cut_edges import Reshape, odds_of_cut_edges
-from bimfit.estimation.likelihood import BeamSet, edge_rows
+from bimfit.estimation.likelihood import BeamSet
 from bimfit.estimation.result import StationEstimate
 from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.pose import Array, Pose2D
@@ -46,31 +46,33 @@ def returns_inside(
     sweeps : int
         How many sweeps share the slice.
     """
-    a, b = (
-        pose.apply(side) for pose, side in zip(poses, (section.gap.side_a, section.gap.side_b), strict=True)
+    sides = _chain(section.gap.side_a), _chain(section.gap.side_b)
+    at = np.array([(pose.u, pose.v, pose.theta) for pose in poses])
+    ends, step = kernels.returns_between(
+        *sides,
+        at,
+        np.array(spread),
+        beams.rays,
+        beams.r,
+        beams.start,
+        beams.eye,
+        beams.spacing,
+        sweeps,
+        _SURE,
     )
-    ring = np.concatenate([a, b[::-1]])
-    index, ends = kernels.returns_within(ring, beams.rays, beams.r, beams.start, beams.eye)
-    if not len(index):
+    if not len(ends):
         return 0
-    step = beam_step(beams, float(np.median(beams.r[index])), sweeps)
-    # what lies on a side itself, deep in the gap where a beam grazes it, is the component
-    clear = _SURE * np.array(spread) + step
-    between = [
-        min(kernels.distance(x, y, side) - c for side, c in zip((a, b), clear.tolist(), strict=True)) > 0.0
-        for _, _, x, y in ends.tolist()
-    ]
-    ends = ends[between]
-    if not len(ends) or _from_behind(a, b, beams, ends, sigma):
+    a, b = (pose.apply(side) for pose, side in zip(poses, sides, strict=True))
+    if _from_behind(a, b, beams, ends, sigma):
         return 0
     across = b[0] - a[0]
     across = across / max(math.hypot(across[0], across[1]), 1e-9)
-    tried = np.repeat(np.array([[poses[0].as_array()], [poses[1].as_array()]]), 2, axis=1)
     closer = _SURE * np.array(spread) + 0.5 * step
+    tried = np.repeat(at[:, None], 2, axis=1)
     tried[0, 1, :2] += closer[0] * across
     tried[1, 1, :2] -= closer[1] * across
-    rows = (edge_rows(section.components[0]), edge_rows(section.components[1]))
-    return int(kernels.loose(ends, *rows, tried, a, b, _SAME * sigma, clear))
+    rows = (section.components[0].rows, section.components[1].rows)
+    return int(kernels.loose(ends, *rows, tried, _SAME * sigma))
 
 
 def _from_behind(a: Array, b: Array, beams: BeamSet, ends: Array, sigma: float) -> bool:
@@ -91,15 +93,9 @@ def _from_behind(a: Array, b: Array, beams: BeamSet, ends: Array, sigma: float) 
     return float(below.mean()) > -_CERTAIN * sigma / math.sqrt(len(below))
 
 
-def beam_step(beams: BeamSet, reach: float, sweeps: int) -> float:
-    """How far apart the beams of one sweep are at a distance ``reach``, m, however many sweeps interleave."""
-    if sweeps <= 1:
-        return beams.spacing * reach
-    ends = np.repeat(beams.eye[:, :2], np.diff(beams.start), axis=0) + reach * beams.d.T
-    middle = beams.d.mean(axis=1)
-    aside = ends @ np.array([-middle[1], middle[0]]) / max(float(np.hypot(*middle)), 1e-9)
-    alone = float(np.ptp(aside)) / max(len(beams) / max(sweeps, 1) - 1.0, 1.0)
-    return max(beams.spacing * reach, alone)
+def _chain(side: Array) -> Array:
+    """A gap's side as the kernels take it."""
+    return np.ascontiguousarray(side, np.float64)
 
 
 def drop_at_mouth(section: JointSection, station: StationEstimate, sigma: float) -> float:
@@ -112,11 +108,11 @@ def drop_at_mouth(section: JointSection, station: StationEstimate, sigma: float)
     for which, c in enumerate(station.components):
         if c.pose is None or len(c.residuals.places) < _FEW:
             continue
-        chain = section.gap.side_a if which == 0 else section.gap.side_b
-        r = c.residuals
+        chain, r = (section.gap.side_a, section.gap.side_b)[which], c.residuals
+        corner = np.array(c.pose.point(*section.gap.corners[which].tolist()))
         total += kernels.drop(
-            edge_rows(section.components[which]), np.ascontiguousarray(chain, np.float64),
-            c.pose.apply(chain[0]), r.residuals, r.places, r.faces, _FEW, _LAST, _ON_CHAIN, sigma,
+            section.components[which].rows, _chain(chain), corner, r.residuals, r.places, r.faces, _FEW,
+            _LAST, _ON_CHAIN, sigma,
         )  # fmt: skip
     return total
 
@@ -124,13 +120,13 @@ def drop_at_mouth(section: JointSection, station: StationEstimate, sigma: float)
 def place_sd(section: JointSection, station: StationEstimate) -> tuple[float, float]:
     """Standard deviation of each component's mouth corner across the gap (u), m; 0 where unknown."""
     out = []
-    for corner, c in zip(section.gap.mouth, station.components, strict=True):
+    for (u, v), c in zip(section.gap.corners.tolist(), station.components, strict=True):
         if c.pose is None or c.covariance is None:
             out.append(0.0)
             continue
-        lever = float(c.pose.turn(corner)[1])
-        C = c.covariance
-        out.append(math.sqrt(max(float(C[0, 0] + lever * (lever * C[2, 2] - 2.0 * C[0, 2])), 0.0)))
+        lever = math.sin(c.pose.theta) * u + math.cos(c.pose.theta) * v
+        (uu, _, turned), _, (_, _, turn) = c.covariance.tolist()
+        out.append(math.sqrt(max(uu + lever * (lever * turn - 2.0 * turned), 0.0)))
     return out[0], out[1]
 
 

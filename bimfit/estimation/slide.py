@@ -92,6 +92,8 @@ def best_start(
 ) -> SlideResult:
     """Slide from every pose, the combined one first, and keep the best; the others become its rivals."""
     slid = [slide_combined(section, table, pose, sensor, fit) for pose in poses]
+    if len(slid) == 1:
+        return slid[0]
     chosen = max(slid, key=lambda result: result.score)
     odds, rival = chosen.rival_odds, chosen.rival
     for result in slid:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -55,10 +56,11 @@ def estimate_station(
     """
     here = sensor_here(sensor, slice_)[0]
     finite = np.isfinite(slice_.points).all(axis=1)
-    if int(finite.sum()) < fit.min_points:
-        reason = f"{int(finite.sum())} returns in the slice, {fit.min_points} are needed"
+    count = int(np.count_nonzero(finite))
+    if count < fit.min_points:
+        reason = f"{count} returns in the slice, {fit.min_points} are needed"
         return _nothing(slice_, combined, here, Status("no_data", reason))
-    if not finite.all():
+    if count < len(finite):
         slice_ = dataclasses.replace(slice_, points=slice_.points[finite])
     if section.components[0].empty or section.components[1].empty:
         return _nothing(slice_, combined, here, Status("no_data", "the section plane misses a component"))
@@ -111,7 +113,7 @@ def _finite(c: ComponentEstimate) -> bool:
     """Whether a component's figures, if it has any, are numbers."""
     if c.pose is None or c.covariance is None:
         return True
-    return bool(np.isfinite(c.pose.as_array()).all() and np.isfinite(c.covariance).all())
+    return math.isfinite(c.pose.u + c.pose.v + c.pose.theta) and bool(np.isfinite(c.covariance).all())
 
 
 def _nothing(slice_: Slice, combined: Pose2D | None, sensor: SensorConfig, status: Status) -> StationEstimate:
