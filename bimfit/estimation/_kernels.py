@@ -904,7 +904,7 @@ def posterior(
     window, least : float
         Greatest and least half width of the integration along the weak direction, m.
     cells : int
-        Cells of the quadrature along the weak direction.
+        Cells of the quadrature along the weak direction; 0 for a glance: the mode and about the evidence.
     draws : (n, 4)
         Student deviates and their log density, for posteriors that the quadrature cannot resolve.
     mean : (3,) out, cov : (3, 3) out
@@ -950,6 +950,9 @@ def posterior(
             q, axes, (i - mid) * step, w[i, 0], w[i, 1], 1.0, pose
         )  # the best lies at an end: move there
         q[:] = pose
+    if cells == 0:
+        _glance(q, axes, rs, step, w, best, top, mean, cov, info)
+        return
     first, final = nodes, -1
     for i in range(nodes):
         if best[i] > top - NEGLIGIBLE:
@@ -968,6 +971,21 @@ def posterior(
     info[5] = math.sqrt(max(_along(cov, axes), 0.0))
     pose[0], pose[1], pose[2] = mean[0], mean[1], mean[2] / rs
     info[8] = log_likelihood(edges, pose, B, start, eye, margin, bearing, lines, runs)
+
+
+@jit
+def _glance(
+    q: Array, axes: Array, rs: float, step: float, w: Array, best: Array, top: float, mean: Array, cov: Array,
+    info: Array,
+) -> None:  # fmt: skip
+    """The profile's best node in place of the mean, and its sum in place of the evidence."""
+    i = int(np.argmax(best))
+    _pose_at(q, axes, (i - best.shape[0] // 2) * step, w[i, 0], w[i, 1], 1.0, mean)
+    cov[:] = 0.0
+    total = 0.0
+    for j in range(best.shape[0]):
+        total += math.exp(best[j] - top)
+    info[0] = top + math.log(2.0 * math.pi * step * total)
 
 
 @jit

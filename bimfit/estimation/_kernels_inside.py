@@ -96,7 +96,7 @@ def _beam_step(rays: Array, start: Ints, eye: Array, reach: float, spacing: floa
             x, y = eye[g, 0] + reach * rays[1, k], eye[g, 1] + reach * rays[2, k]
             aside = (y * mx - x * my) / size
             low, high = min(low, aside), max(high, aside)
-    return max(spacing * reach, (high - low) / max(n / sweeps - 1.0, 1.0))
+    return max(spacing * reach, float((high - low) / max(n / sweeps - 1.0, 1.0)))
 
 
 @jit

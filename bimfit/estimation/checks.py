@@ -202,7 +202,7 @@ def _widened(section: JointSection, a: Pose2D, b: Pose2D, pose: Pose2D) -> float
     across = (bu - au) / max(width, 1e-9), (bv - av) / max(width, 1e-9)
     (x0, y0), (x1, y1) = a.point(au, av), b.point(bu, bv)
     along = (c * across[0] - s * across[1]) * (x1 - x0) + (s * across[0] + c * across[1]) * (y1 - y0)
-    return along - width
+    return float(along - width)
 
 
 def _direction(axis: Array) -> str:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -12,7 +14,7 @@ from bimfit.config import FitConfig, SensorConfig
 from bimfit.estimation import checks
 from bimfit.estimation.context import Context, station_context
 from bimfit.estimation.ownership import BeamTable, Mask, Sight, Views, second_round
-from bimfit.estimation.posterior import Posterior, Window, component_posterior
+from bimfit.estimation.posterior import Glance, Posterior, Window, component_glance, component_posterior
 from bimfit.estimation.residuals import residuals_of
 from bimfit.estimation.result import Residuals, StationEstimate
 from bimfit.estimation.slide import SlideResult
@@ -153,23 +155,49 @@ def reshaped(
     window = context.window
     # the combined pose was found with another shape, for which a prior about it would speak at every station
     window = dataclasses.replace(window, shift=_LOOSE * window.shift, angle=_LOOSE * window.angle)
-    return reshaped_with(context, station, pose, which, profiles, None, window)
+    return Reshaper(context, station, pose, window).posteriors(which, profiles, None)
 
 
-def reshaped_with(
-    context: Context,
-    station: StationEstimate,
-    pose: Pose2D,
-    which: int,
-    profiles: Sequence[Profile],
-    begin: Pose2D | None,
-    window: Window,
-) -> list[Posterior | None]:
-    """The same with the station's own context, begun at a pose or where the component is."""
-    sight = context.look(pose)
-    a, b = (pose if c.pose is None else c.pose for c in station.components)
-    views = context.weigh((a, b), sight.usable)
-    shallow = _shallow(context, views)
-    use, table = second_round(which, views, sight, context.table, context.model, pose, shallow)
-    begin = begin or station.components[which].pose
-    return [component_posterior(p.rows, pose, table, window, use=use, begin=begin) for p in profiles]
+@dataclass(frozen=True)
+class Reshaper:
+    """Tries other shapes of one component of an estimated station, the other held where it is.
+
+    Attributes
+    ----------
+    pose : Pose2D
+        The station's combined pose.
+    window : Window
+        The components' window about it.
+    """
+
+    context: Context
+    station: StationEstimate
+    pose: Pose2D
+    window: Window
+
+    def posteriors(
+        self, which: int, profiles: Sequence[Profile], begin: Pose2D | None
+    ) -> list[Posterior | None]:
+        """Posterior of each shape, begun at a pose or where the component is."""
+        (use, table), begin = self._heard[which], begin or self.station.components[which].pose
+        return [
+            component_posterior(p.rows, self.pose, table, self.window, use=use, begin=begin) for p in profiles
+        ]
+
+    def glances(self, which: int, profiles: Sequence[Profile], begin: Pose2D | None) -> list[Glance | None]:
+        """The same at a glance."""
+        (use, table), begin = self._heard[which], begin or self.station.components[which].pose
+        return [component_glance(p.rows, self.pose, table, self.window, use, begin) for p in profiles]
+
+    @cached_property
+    def _heard(self) -> tuple[tuple[Mask, BeamTable], tuple[Mask, BeamTable]]:
+        """For A and B the beams that speak for it, and what they cost, given the other."""
+        context, pose = self.context, self.pose
+        sight = context.look(pose)
+        a, b = (pose if c.pose is None else c.pose for c in self.station.components)
+        views = context.weigh((a, b), sight.usable)
+        shallow = _shallow(context, views)
+        first, second = (
+            second_round(which, views, sight, context.table, context.model, pose, shallow) for which in (0, 1)
+        )
+        return first, second

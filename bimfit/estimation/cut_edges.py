@@ -11,13 +11,13 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from bimfit.estimation.posterior import Posterior
+from bimfit.estimation.posterior import Glance, Posterior
 from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.pose import Array, Pose2D
 from bimfit.geometry.profile import Mask, Profile
 
-Reshape = Callable[[int, Sequence[Profile], Pose2D | None], Sequence[Posterior | None]]
-"""Posteriors of component 0 or 1 for each of several shapes of it, begun at a pose or where it is."""
+Reshape = Callable[[int, Sequence[Profile], Pose2D | None], Sequence[Posterior | Glance | None]]
+"""What is found of component 0 or 1 for each of several shapes of it, begun at a pose or where it is."""
 CUTS = ((0.008, 0.008), (0.006, 0.020))
 """How much of the outer face and of the gap's side is cut off in the alternatives: a chamfer, a bevel, m."""
 _MOST = 0.95

@@ -25,6 +25,9 @@ _SUSPICIOUS = 2.2
 _ODDS = (4.0, 1.0, 0.0, -math.inf)
 """Greatest log-odds of cut edges with no return inside the gap, with one, two and more."""
 
+_DOUBT = 3.0
+"""So much the log-odds at a glance may be off."""
+
 
 def returns_inside(
     section: JointSection,
@@ -136,14 +139,16 @@ def with_inside(
     beams: BeamSet,
     sigma: float,
     sweeps: int,
+    glance: Reshape,
     reshape: Reshape,
 ) -> StationEstimate:
     """The station, ``rejected`` where something is inside the gap or its edges are not as designed.
 
     Parameters
     ----------
-    reshape : callable
-        Tries other shapes of a component on the slice; called only where its edges look suspicious.
+    glance, reshape : callable
+        Try other shapes of a component on the slice, in brief and in full: the one only where its edges look
+        suspicious, the other only where that leaves them so.
     """
     a, b = (c.pose for c in station.components)
     if a is None or b is None or not station.status.measured:
@@ -153,7 +158,9 @@ def with_inside(
     most = _ODDS[min(inside, len(_ODDS) - 1)]
     if not inside and drop_at_mouth(section, station, sigma) < _SUSPICIOUS:
         return station
-    if math.isfinite(most) and odds_of_cut_edges(section, reshape) <= most:
+    if math.isfinite(most) and (
+        odds_of_cut_edges(section, glance) <= most - _DOUBT or odds_of_cut_edges(section, reshape) <= most
+    ):
         return station
     reason = (
         "the edges at the mouth are not shaped as designed: a bevel or a chamfer explains the returns better"

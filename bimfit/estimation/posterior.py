@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -173,15 +174,9 @@ def component_posterior(
     Posterior or None
         None where hardly any return lies on the component.
     """
-    other = _NOWHERE if begin is None else begin.as_array()
-    out = np.empty(36)
     speak = np.ones(len(table), bool) if use is None else use
-    found = _kernels.component(
-        rows, start.as_array(), other, speak, table.rows, table.start, table.eye, table.margin, _NEAR,
-        _MIN_HITS, _BEARING * table.spacing, window.deviations, window.reach, window.least, _CELLS, _draws(),
-        out,
-    )  # fmt: skip
-    if not found:
+    out = _integrated(rows, start, table, window, speak, begin, _CELLS)
+    if out is None:
         return None
     u, v, theta = out[:3].tolist()
     evidence, ranges, _, _, _, sd, mass, offset, _, _, ess, _, radius = out[23:36].tolist()
@@ -200,3 +195,38 @@ def component_posterior(
         ess=ess,
         heard=Heard(rows, table, speak),
     )
+
+
+class Glance(NamedTuple):
+    """Where a component is most likely, and about the log evidence: a posterior at a fraction of its cost."""
+
+    pose: Pose2D
+    evidence: float
+
+
+def component_glance(
+    rows: Array, start: Pose2D, table: BeamTable, window: Window, use: NDArray[np.bool_], begin: Pose2D | None
+) -> Glance | None:
+    """What :func:`component_posterior` would find, from the profile along the weak direction alone."""
+    out = _integrated(rows, start, table, window, use, begin, 0)
+    return None if out is None else Glance(Pose2D(*out[:3].tolist()), float(out[23]))
+
+
+def _integrated(
+    rows: Array,
+    start: Pose2D,
+    table: BeamTable,
+    window: Window,
+    use: NDArray[np.bool_],
+    begin: Pose2D | None,
+    cells: int,
+) -> Array | None:
+    """Figures of a posterior as the kernel gives them, shape (36,)."""
+    other = _NOWHERE if begin is None else begin.as_array()
+    out = np.empty(36)
+    found = _kernels.component(
+        rows, start.as_array(), other, use, table.rows, table.start, table.eye, table.margin, _NEAR,
+        _MIN_HITS, _BEARING * table.spacing, window.deviations, window.reach, window.least, cells, _draws(),
+        out,
+    )  # fmt: skip
+    return out if found else None

@@ -9,17 +9,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from bimfit.config import FitConfig, SensorConfig
-from bimfit.estimation.components import components_at, reshaped_with
+from bimfit.estimation.components import Reshaper, components_at
 from bimfit.estimation.context import Context, sensor_here, station_context
 from bimfit.estimation.inside import with_inside
 from bimfit.estimation.lookalikes import gap_places, with_lookalikes
 from bimfit.estimation.placing import placed
-from bimfit.estimation.posterior import Posterior
 from bimfit.estimation.result import ComponentEstimate, StationEstimate
 from bimfit.estimation.slide import best_start
 from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.pose import Pose2D
-from bimfit.geometry.profile import Profile
 from bimfit.geometry.slice import Slice
 from bimfit.geometry.status import Status
 
@@ -55,7 +53,7 @@ def estimate_station(
         Always; what could not be measured has a status that says why and no pose.
     """
     here = sensor_here(sensor, slice_)[0]
-    finite = np.isfinite(slice_.points).all(axis=1)
+    finite = np.asarray(np.isfinite(slice_.points).all(axis=1))
     count = int(np.count_nonzero(finite))
     if count < fit.min_points:
         reason = f"{count} returns in the slice, {fit.min_points} are needed"
@@ -100,13 +98,13 @@ def _estimated(
 
 def _with_inside(context: Context, station: StationEstimate) -> StationEstimate:
     """The station, judged by what is inside its gap and by the edges of its mouth."""
-
-    def reshape(which: int, profiles: Sequence[Profile], begin: Pose2D | None) -> list[Posterior | None]:
-        assert station.combined is not None
-        return reshaped_with(context, station, station.combined, which, profiles, begin, context.window)
-
-    sigma = context.sensor.sigma
-    return with_inside(station, context.section, context.beams, sigma, context.slice.sweeps, reshape)
+    if station.combined is None:
+        return station
+    reshaper = Reshaper(context, station, station.combined, context.window)
+    sigma, sweeps = context.sensor.sigma, context.slice.sweeps
+    return with_inside(
+        station, context.section, context.beams, sigma, sweeps, reshaper.glances, reshaper.posteriors
+    )
 
 
 def _finite(c: ComponentEstimate) -> bool:

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from bimfit.config import FitConfig, SensorConfig
-from bimfit.estimation.components import reshaped
+from bimfit.estimation.components import Reshaper, reshaped
+from bimfit.estimation.context import station_context
 from bimfit.estimation.cut_edges import cut_off, odds_of_cut_edges
 from bimfit.estimation.station import estimate_station
 from bimfit.geometry.pose import Pose2D
@@ -61,3 +62,25 @@ def test_a_slice_tells_a_bevel_from_a_square_edge():
     assert max(odds["square"]) < 4.0
     assert np.median(odds["bevel"]) > 10.0
     assert odds_of_cut_edges(sec, lambda which, shapes, begin: [None] * len(shapes)) == -np.inf
+
+
+@pytest.mark.parametrize("kind", ["square", "bevel"])
+def test_a_glance_leads_to_the_verdict_of_the_whole_integrals(kind):
+    sec, odds = S.butt(), []
+    cut = [
+        cut_off(c, s, 0.006, 0.020)
+        for c, s in zip(sec.components, (sec.gap.side_a, sec.gap.side_b), strict=True)
+    ]
+    for seed in range(10):
+        slice_ = S.scan(np.random.default_rng(seed), sec.components if kind == "square" else cut)
+        e = estimate_station(sec, slice_, Pose2D(), SensorConfig(), FitConfig())
+        context = station_context(sec, slice_, e.combined, SensorConfig(), FitConfig())
+        tries = Reshaper(context, e, e.combined, context.window)
+        odds.append([odds_of_cut_edges(sec, way) for way in (tries.glances, tries.posteriors)])
+    glance, full = np.transpose(odds)
+    if kind == "square":
+        assert np.abs(np.median(glance - full)) < 1.0
+        assert full.max() < 4.0
+    # what the whole integrals would refuse is never let pass at a glance
+    assert np.all(glance[full > 4.0] > 1.0)
+    assert kind == "square" or np.mean(full > 4.0) > 0.8
