@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from bimfit.errors import BimfitError, ExportError
 from bimfit.files import protect_inputs, write_text
-from bimfit.pipeline.document import closest
+from bimfit.pipeline.document import TRUSTED, closest
 from bimfit.pipeline.records import JointResult, SurveyResult
 from bimfit.pipeline.results import stations_to_csv, survey_to_dict, to_json
 
@@ -209,7 +209,8 @@ def describe(joint: JointResult) -> str:
         "possible clash": "; the elements may overlap (possible clash)",
         "touch": "; the elements touch",
     }
-    near = touching.get(closest(station.nearness for station in joint.stations), "")
+    trusted = [station for station in joint.stations if station.status.name in TRUSTED]
+    near = touching.get(closest(station.nearness for station in trusted), "")
     volume = "" if joint.volumes is None else f", volume {joint.volumes.mesh * 1e6:.1f} cm3"
     designed = round(joint.joint.width * 1e3, 1) + 0.0  # never -0.0
     mean = f"mean {statistics.fmean(widths):.1f}{plus_minus}"
