@@ -11,7 +11,9 @@ from bimfit.pipeline.output import describe
 def station(name, width):
     gap = SimpleNamespace(width_mouth=width, sigma=SimpleNamespace(width=1e-4))
     contact = "overlap" if width < 0.0 else "clearance"
-    return SimpleNamespace(status=Status(name, ""), gap=gap, nearness=(contact, width, 1e-4))
+    return SimpleNamespace(
+        status=Status(name, "" if name == "ok" else "for a reason"), gap=gap, nearness=(contact, width, 1e-4)
+    )
 
 
 @pytest.mark.parametrize(
