@@ -9,7 +9,10 @@ Constants of ``_kernels_table.py`` are compiled in: remove ``__pycache__`` after
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from bimfit._kernels import jit, jit_bare, jit_inner_bare, jit_inner_fast
 from bimfit.registration._kernels_table import FULL, LANE, RIM
@@ -31,6 +34,61 @@ EXPANDED = 8  # from here on, nodes expanded of each level; slot 8 counts rows o
 STATE_SIZE = 32
 # what a call of ``search`` ends with
 DONE, TOLERANCE, BUDGET, HEAP_FULL, FOUND_FULL = 0, 1, 2, 3, 4
+
+
+class Model(NamedTuple):
+    """What the search reads of a model and a lattice; see ``Tables`` and ``Lattice``."""
+
+    cosine: NDArray[np.float64]
+    sine: NDArray[np.float64]
+    step: NDArray[np.float64]
+    size: NDArray[np.int64]
+    nodes: NDArray[np.int64]
+    half_angle: NDArray[np.float64]
+    lanes: NDArray[np.uint64]
+    blocks: NDArray[np.uint8]
+    place: NDArray[np.int64]
+    quads: NDArray[np.uint64]
+    quad_place: NDArray[np.int64]
+    quad_scale: NDArray[np.float64]
+    class_of: NDArray[np.uint8]
+    slots: NDArray[np.int64]
+
+
+class Scratch(NamedTuple):
+    """What the search writes: the slice's points in cells, what is known of them, the queue, the state."""
+
+    start: NDArray[np.float64]
+    pu: NDArray[np.float64]
+    pv: NDArray[np.float64]
+    weight: NDArray[np.uint64]
+    heft: NDArray[np.float32]
+    classes: NDArray[np.uint8]
+    cu: NDArray[np.int32]
+    cv: NDArray[np.int32]
+    have: NDArray[np.uint8]
+    lists: NDArray[np.int32]
+    list_counts: NDArray[np.int32]
+    near: NDArray[np.uint8]
+    near_have: NDArray[np.uint8]
+    at: NDArray[np.int32]
+    words: NDArray[np.uint64]
+    halves: NDArray[np.int32]
+    coef: NDArray[np.float32]
+    sums: NDArray[np.float64]
+    turns: NDArray[np.float64]
+    tally: NDArray[np.int32]
+    part: NDArray[np.uint16]
+    box: NDArray[np.int64]
+    root: NDArray[np.int32]
+    crest: NDArray[np.int64]
+    keys: NDArray[np.int64]
+    codes: NDArray[np.int64]
+    found_codes: NDArray[np.int64]
+    found_scores: NDArray[np.int64]
+    state: NDArray[np.int64]
+    pivot: NDArray[np.float64]
+    motion: NDArray[np.float64]
 
 
 # ---------------------------------------------------------------- cells and leaves
@@ -252,7 +310,7 @@ def bound_root(slot, n, lists, counts, blocks, place, level, nv, nu, part, root,
     spill(part, stride, nv, nu, root, to)
 
 
-@jit
+@jit_bare
 def point_classes(n, pu, pv, qu, qv, first, eta, class_of, out):
     """Slack class of every point on the levels from ``first`` on; ``eta`` (levels,) is half a node's angle.
 
@@ -501,13 +559,16 @@ def list_blocks(
 
 
 @jit_bare
-def search(
-    options, pu, pv, weight, heft, start, cosine, sine, size, count, lanes, blocks, place, quads, quad_place,
-    quad_scale, class_of, classes, slots, prior, prior_at, cu, cv, have, lists, list_counts, near, near_have,
-    at, words, halves, coef, sums, turns, tally, part, box, root, crest, keys, codes, found_codes,
-    found_scores, state,
-):  # fmt: skip
-    """Best-first branch and bound over (theta, v, u); resumable, see ``grcsm.py`` for the arguments."""
+def search(options, model, prior, prior_at, work):
+    """Best-first branch and bound over (theta, v, u); resumable, see ``grcsm.py`` for the options."""
+    (
+        cosine, sine, _, size, count, _, lanes, blocks, place, quads, quad_place, quad_scale, class_of, slots,
+    ) = model  # fmt: skip
+    (
+        start, pu, pv, weight, heft, classes, cu, cv, have, lists, list_counts, near, near_have, at, words,
+        halves, coef, sums, turns, tally, part, box, root, crest, keys, codes, found_codes, found_scores,
+        state, _, _,
+    ) = work  # fmt: skip
     n, first = options[0], options[1]
     chunk, limit, slice_limit = options[3], options[4], options[5]
     collect, floor_score, has_prior, total = options[6], options[7], options[8], options[9]
@@ -745,29 +806,60 @@ PIVOT_U, PIVOT_V, REACH, SHARE, RMSE = 0, 1, 2, 3, 4
 FEW, FAR = 10, 11  # besides what ``search`` ends with: too few points left; farther out than the tables reach
 
 
-@jit
-def leaf_score(
-    code, n, pu, pv, weight, chunk, start, cosine, sine, lanes, prior, prior_at, has_prior, at, cu, cv
-):
+@jit_bare
+def leaf_score(code, n, chunk, model, prior, prior_at, has_prior, work):
     """Score of one leaf, its log-prior added."""
     mask = (1 << SHIFT_NODE) - 1
     t, v, u = code >> (2 * SHIFT_NODE), (code >> SHIFT_NODE) & mask, code & mask
-    out = np.empty(1, np.int64)
-    fill_cells(0, n, cosine[t], sine[t], pu, pv, start, cu, cv)
-    score_box(0, n, cu, cv, weight, chunk, lanes, v, 1, u, 1, at, out, 0)
+    fill_cells(0, n, model.cosine[t], model.sine[t], work.pu, work.pv, work.start, work.cu, work.cv)
+    score_box(
+        0, n, work.cu, work.cv, work.weight, chunk, model.lanes, v, 1, u, 1, work.at, work.box, 0
+    )  # fmt: skip
+    score = work.box[0]
     if has_prior:
-        out[0] += log_prior(prior, prior_at, 0, t, v, u)
-    return out[0]
+        score += log_prior(prior, prior_at, 0, t, v, u)
+    return score
 
 
-@jit
+@jit_bare
+def set_up(kept, options, frame, model, work):
+    """Ready the scratch arrays and the options for a slice whose ``kept`` points are prepared."""
+    n = (kept + PAD - 1) // PAD * PAD
+    start, pivot, step = work.start, work.pivot, model.step
+    start[0] = (pivot[0] + frame[8] - frame[10]) / step[0]
+    start[1] = (pivot[1] + frame[9] - frame[11]) / step[1]
+    start[2], start[3], start[4] = step[1] / step[0], step[0] / step[1], frame[12]
+    total, most = np.int64(0), np.uint64(1)
+    for k in range(kept):
+        total += np.int64(work.weight[k])
+        most = max(most, work.weight[k])
+    options[0], options[3], options[9] = n, max(1, LANE_SUM // (FULL * np.int64(most))), total
+    work.have[:] = 0
+    work.near_have[:] = 0
+    work.list_counts[:] = -1
+    point_classes(
+        n, work.pu, work.pv, step[0], step[1], options[10], model.half_angle, model.class_of, work.classes
+    )
+    work.state[:] = 0
+    work.state[BEST] = NOTHING
+
+
+@jit_bare
+def leaf_motion(code, motion, frame, model, pivot, out):
+    """The leaf's motion of the data, after ``motion``: a turn about the pivot, then a shift."""
+    mask, step = (1 << SHIFT_NODE) - 1, model.step
+    c, s = model.cosine[code >> (2 * SHIFT_NODE)], model.sine[code >> (2 * SHIFT_NODE)]
+    du, dv = motion[2] - pivot[0], motion[3] - pivot[1]
+    out[0] = c * motion[0] - s * motion[1]
+    out[1] = s * motion[0] + c * motion[1]
+    out[2] = c * du - s * dv + pivot[0] + frame[8] + step[0] * (code & mask)
+    out[3] = s * du + c * dv + pivot[1] + frame[9] + step[1] * ((code >> SHIFT_NODE) & mask)
+
+
+@jit_bare
 def match_run(
-    begin, points, ends, motions, given, hints, frame, edges, options, step, cosine, sine, size, count,
-    half_angle,
-    lanes, blocks, place, quads, quad_place, quad_scale, class_of, slots, prior, prior_at, pu, pv, weight,
-    heft,
-    classes, cu, cv, have, lists, list_counts, near, near_have, at, words, halves, coef, sums, turns, tally,
-    part, box, root, crest, keys, codes, found_codes, found_scores, state, ints, reals,
+    begin, points, ends, motions, given, hints, frame, edges, options, model, prior, prior_at, work, ints,
+    reals,
 ):  # fmt: skip
     """Match slices one after the other from ``begin`` on; the first that was not done.
 
@@ -776,79 +868,46 @@ def match_run(
     (its motion u, v, theta), or NaN. ``frame``: see ``batch.py``. A slice is left undone where the queue is
     full or the tables do not reach far enough: the caller makes room and comes again.
     """
-    start = np.empty(5)
-    got = np.empty(4)
-    motion = np.empty(4)
-    nobody = given[:0]
+    state, pivot = work.state, work.pivot
     for i in range(begin, ends.shape[0]):
         first = ends[i - 1] if i > 0 else 0
         own = points[first : ends[i]]
         limit = own.shape[0] + PAD
         prepare(
-            own, motions[i], frame[0:4], frame[4], frame[5], 1.0 / step[0], 1.0 / step[1],
-            given[first : ends[i]] if given.shape[0] > 0 else nobody, pu[:limit], pv[:limit], weight[:limit],
-            heft[:limit], got,
+            own, motions[i], frame[0:4], frame[4], frame[5], 1.0 / model.step[0], 1.0 / model.step[1],
+            given[first : ends[i]] if given.shape[0] > 0 else given[:0], work.pu[:limit], work.pv[:limit],
+            work.weight[:limit], work.heft[:limit], pivot,
         )  # fmt: skip
-        kept = int(got[3])
-        reals[i, PIVOT_U], reals[i, PIVOT_V], reals[i, REACH] = got[0], got[1], got[2]
+        kept = int(pivot[3])
+        reals[i, PIVOT_U], reals[i, PIVOT_V], reals[i, REACH] = pivot[0], pivot[1], pivot[2]
         ints[i, KEPT] = kept
         if kept < frame[6]:
             ints[i, HOW] = FEW
             continue
-        if got[2] > frame[7]:
+        if pivot[2] > frame[7]:
             ints[i, HOW] = FAR
             return i
-        n = (kept + PAD - 1) // PAD * PAD
-        start[0] = (got[0] + frame[8] - frame[10]) / step[0]
-        start[1] = (got[1] + frame[9] - frame[11]) / step[1]
-        start[2], start[3], start[4] = step[1] / step[0], step[0] / step[1], frame[12]
-        total, most = np.int64(0), np.uint64(1)
-        for k in range(kept):
-            total += np.int64(weight[k])
-            most = max(most, weight[k])
-        options[0], options[3], options[9] = n, max(1, LANE_SUM // (FULL * np.int64(most))), total
-        have[:] = 0
-        near_have[:] = 0
-        list_counts[:] = -1
-        point_classes(n, pu, pv, step[0], step[1], options[10], half_angle, class_of, classes)
-        state[:] = 0
-        state[BEST] = NOTHING
+        set_up(kept, options, frame, model, work)
         if not np.isnan(hints[i, 0]):
-            code = nearest_leaf(hints[i], motions[i], got, frame, step, count)
+            code = nearest_leaf(hints[i], motions[i], pivot, frame, model.step, model.nodes)
             if code >= 0:
                 state[BEST_CODE] = code
                 state[BEST] = leaf_score(
-                    code, n, pu, pv, weight, options[3], start, cosine, sine, lanes, prior, prior_at,
-                    options[8],
-                    at, cu, cv,
-                )  # fmt: skip
-        ended = search(
-            options, pu[:n], pv[:n], weight[:n], heft[:n], start, cosine, sine, size, count, lanes, blocks,
-            place,
-            quads, quad_place, quad_scale, class_of, classes, slots, prior, prior_at, cu, cv, have, lists,
-            list_counts, near, near_have, at, words, halves, coef, sums, turns, tally, part, box, root, crest,
-            keys, codes, found_codes, found_scores, state,
-        )  # fmt: skip
-        ints[i, HOW] = ended
-        if ended == HEAP_FULL:
+                    code, options[0], options[3], model, prior, prior_at, options[8], work
+                )
+        ints[i, HOW] = search(options, model, prior, prior_at, work)
+        if ints[i, HOW] == HEAP_FULL:
             return i
         ints[i, SCORE], ints[i, OPEN], ints[i, LEAF] = state[BEST], state[BOUND], state[BEST_CODE]
         ints[i, WORK] = state[EVALUATIONS]
-        # the leaf's motion of the data, after ``motions``: turn about the pivot, then shift
-        code, mask = state[BEST_CODE], (1 << SHIFT_NODE) - 1
-        c, s = cosine[code >> (2 * SHIFT_NODE)], sine[code >> (2 * SHIFT_NODE)]
-        du, dv = motions[i, 2] - got[0], motions[i, 3] - got[1]
-        motion[0] = c * motions[i, 0] - s * motions[i, 1]
-        motion[1] = s * motions[i, 0] + c * motions[i, 1]
-        motion[2] = c * du - s * dv + got[0] + frame[8] + step[0] * (code & mask)
-        motion[3] = s * du + c * dv + got[1] + frame[9] + step[1] * ((code >> SHIFT_NODE) & mask)
-        near_count, squares = fitness(own, motion, edges, frame[13])
+        leaf_motion(state[BEST_CODE], motions[i], frame, model, pivot, work.motion)
+        near_count, squares = fitness(own, work.motion, edges, frame[13])
         reals[i, SHARE] = near_count / own.shape[0]
         reals[i, RMSE] = np.sqrt(squares / near_count)
     return ends.shape[0]
 
 
-@jit
+@jit_bare
 def nearest_leaf(pose, motion, pivot, frame, step, count):
     """Code of the leaf nearest to a motion of the model, or -1 outside the window.
 
@@ -963,7 +1022,7 @@ def printed(
         level = -1
 
 
-@jit
+@jit_bare
 def prepare(points, motion, box, shift, swing, scale_u, scale_v, given, pu, pv, weight, heft, out):
     """Carry points by ``motion`` (cos, sin, u, v), choose the pivot, drop what can never meet the model.
 
@@ -1002,7 +1061,7 @@ def prepare(points, motion, box, shift, swing, scale_u, scale_v, given, pu, pv, 
     out[0], out[1], out[2], out[3] = pivot_u, pivot_v, reach, m
 
 
-@jit
+@jit_bare
 def fitness(points, motion, edges, gate):
     """Number of points within ``gate`` of the edges after ``motion``, and their sum of squared distances."""
     count, total = 0, 0.0

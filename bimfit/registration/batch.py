@@ -122,8 +122,7 @@ def _search(
         end = begin + 1 if reach > 0.0 else count
         begin = kernels.match_run(
             begin, points, ends[:end], motions, weights, hints, _frame(target, tables, config), target.edges,
-            options, tables.step, tables.cosine, tables.sine, lattice.size, lattice.nodes, plan.half_angle,
-            *tables.arrays, plan.slots, prior, prior_at, *work.arrays, ints, reals,
+            options, tables.model, prior, prior_at, work.scratch, ints, reals,
         )  # fmt: skip
         reach = 0.0
         if begin < end:

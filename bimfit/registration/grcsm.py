@@ -8,7 +8,6 @@ import threading
 import time
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -192,8 +191,6 @@ class Plan:
     lowest: int
     roots: int
     fan: int
-    slots: Integers
-    half_angle: Array
     slot_count: int
     near: int
     tally: int
@@ -213,9 +210,8 @@ class Plan:
         split = [(size[h] // size[h - 1])[:2] for h in range(1, top + 1)]
         tally = max([1, *(int(v) * (int(u) + table_kernels.RIM) for u, v in split)])
         part = int(nodes[first, 1] * place[first, 0, 5]) + 2 * table_kernels.RIM if place.ndim == 3 else 1
-        slots = np.concatenate([[0], ends[:-1]]).astype(np.int64)
         return cls(
-            first, lowest, int(nodes[first].prod()), fan, slots, lattice.half_angle, int(ends[-1]),
+            first, lowest, int(nodes[first].prod()), fan, int(ends[-1]),
             int(nodes[quads, 2].sum()), tally, part, capacity,
         )  # fmt: skip
 
@@ -250,19 +246,15 @@ class Workspace:
         self.values = np.empty_like(self.found)
 
     @cached_property
-    def scratch(self) -> tuple[NDArray[Any], ...]:
-        """What ``search`` scribbles on, in its order."""
-        return (
-            self.cu, self.cv, self.have, self.lists, self.list_counts, self.near, self.near_have, self.at,
-            self.words, self.halves, self.coef, self.sums, self.turns, self.tally, self.part, self.box,
-            self.root, self.crest, self.keys, self.codes, self.found, self.values,
+    def scratch(self) -> kernels.Scratch:
+        """All of it, as the kernels take it."""
+        return kernels.Scratch(
+            np.empty(5), self.pu, self.pv, self.weight, self.heft, self.classes, self.cu, self.cv, self.have,
+            self.lists, self.list_counts, self.near, self.near_have, self.at, self.words, self.halves,
+            self.coef, self.sums, self.turns, self.tally, self.part, self.box, self.root, self.crest,
+            self.keys, self.codes, self.found, self.values, np.empty(kernels.STATE_SIZE, np.int64),
+            np.empty(4), np.empty(4),
         )  # fmt: skip
-
-    @cached_property
-    def arrays(self) -> tuple[NDArray[Any], ...]:
-        """The same for ``match_run``, which prepares the points, too."""
-        state = np.empty(kernels.STATE_SIZE, np.int64)
-        return (self.pu, self.pv, self.weight, self.heft, self.classes, *self.scratch, state)
 
     def clear(self) -> None:
         """Forget the last slice."""
@@ -277,7 +269,6 @@ class Workspace:
             array[: len(old)] = old
             setattr(self, name, array)
         self.__dict__.pop("scratch", None)
-        self.__dict__.pop("arrays", None)
 
 
 _LOCAL = threading.local()
@@ -319,7 +310,7 @@ def run(
     work.clear()
     prior, prior_at, has_prior = prior_table(config, lattice, problem.unit)
     kernels.point_classes(
-        n, problem.pu, problem.pv, lattice.step[0], lattice.step[1], plan.lowest, plan.half_angle,
+        n, problem.pu, problem.pv, lattice.step[0], lattice.step[1], plan.lowest, lattice.half_angle,
         tables.class_of, work.classes,
     )  # fmt: skip
     state = np.zeros(kernels.STATE_SIZE, np.int64)
@@ -334,12 +325,11 @@ def run(
          collect_from is not None, collect_from or 0, has_prior, int(problem.weight.sum())], np.int64,
     )  # fmt: skip
     while True:
-        ended = kernels.search(
-            options, problem.pu, problem.pv, problem.weight, problem.heft, problem.start, tables.cosine,
-            tables.sine,
-            lattice.size, lattice.nodes, *tables.arrays, work.classes, plan.slots, prior, prior_at,
-            *work.scratch, state,
+        scratch = work.scratch._replace(
+            start=problem.start, pu=problem.pu, pv=problem.pv, weight=problem.weight, heft=problem.heft,
+            state=state,
         )  # fmt: skip
+        ended = kernels.search(options, tables.model, prior, prior_at, scratch)
         if ended == kernels.HEAP_FULL:
             work.grow("keys", "codes")
         elif ended == kernels.FOUND_FULL:

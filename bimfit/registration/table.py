@@ -16,6 +16,7 @@ from bimfit.config import Bound
 from bimfit.errors import ConfigError
 from bimfit.geometry.pose import Array
 from bimfit.registration import _kernels_table as _kernels
+from bimfit.registration._kernels import Model
 from bimfit.registration.lattice import Integers, Lattice
 from bimfit.registration.levels import (
     MAX_CLASSES,
@@ -84,16 +85,14 @@ class Tables:
     frames: dict[float, Array] = field(default_factory=dict, repr=False, compare=False)
 
     @cached_property
-    def step(self) -> Array:
-        """The lattice's steps, for the kernels."""
-        return np.array(self.lattice.step)
-
-    @cached_property
-    def arrays(self) -> tuple[NDArray[Any], ...]:
-        """What the kernels read of the model, in their order."""
-        return (
+    def model(self) -> Model:
+        """What the kernels read of all this."""
+        lattice = self.lattice
+        slots = np.concatenate([[0], lattice.nodes[:-1, 2].cumsum()]).astype(np.int64)
+        return Model(
+            self.cosine, self.sine, np.array(lattice.step), lattice.size, lattice.nodes, lattice.half_angle,
             self.lanes, self.blocks, self.block_place, self.quads, self.quad_place, self.quad_scale,
-            self.class_of,
+            self.class_of, slots,
         )  # fmt: skip
 
     @property
