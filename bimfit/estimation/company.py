@@ -6,6 +6,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from bimfit.estimation.departure import Departure, departure
 from bimfit.estimation.result import StationEstimate
 from bimfit.geometry.joint_section import JointSection
@@ -22,6 +24,8 @@ _BEND_MATTERS = 0.02
 """A bend, by this: what shows of one is what no turn of the component takes up."""
 _NEIGHBOURS, _MOSTLY = 6, 0.6
 _SPEAKS = 0.3
+_FAR, _TOGETHER = 0.030, 0.0125
+"""A joint does not lie so far (m) from where most stations around it lie so near to one another."""
 
 
 def with_company(
@@ -43,6 +47,7 @@ def with_company(
     together = math.hypot(*(d.bow for d in departures)) > _BOTH
     reasons = [_reason(d, sigma, _TAKES_PART if together else _BENT) for d in departures]
     rejected = [e.status.name == "rejected" for e in stations]
+    astray = _astray(stations)
     out = []
     for i, station in enumerate(stations):
         around = [
@@ -52,6 +57,10 @@ def with_company(
             bad = sum(around)
             reason = f"{bad} of the {len(around) - 1} stations around it do not fit the design"
             out.append(replace(station, status=Status("weak", reason)))
+            continue
+        if station.status.name in ("ok", "weak") and i in astray:
+            reason = f"it lies {astray[i] * 1e3:.0f} mm from where the stations around it see the joint"
+            out.append(replace(station, status=Status("ambiguous", reason)))
             continue
         out.append(_with_shape(station, reasons))
     return tuple(out)
@@ -64,6 +73,26 @@ def _trusted(stations: Sequence[StationEstimate]) -> list[int]:
     """
     fine = [i for i, e in enumerate(stations) if e.status.name == "ok"]
     return fine if len(fine) >= _SPEAKS * len(stations) else list(range(len(stations)))
+
+
+def _astray(stations: Sequence[StationEstimate]) -> dict[int, float]:
+    """Stations far from a place on which those around them agree, and how far, m.
+
+    Glare can make a slice look like the joint in another place, as a whole and well explained.
+    """
+    known = [i for i, e in enumerate(stations) if e.combined is not None and e.status.measured]
+    places = {i: e.combined.as_array()[:2] for i, e in enumerate(stations) if e.combined is not None}
+    out = {}
+    for i in known:
+        around = np.array([places[k] for k in known if 0 < abs(k - i) <= _NEIGHBOURS])
+        if len(around) < _NEIGHBOURS:
+            continue
+        middle = np.median(around, axis=0)
+        near = np.hypot(*(around - middle).T) < _TOGETHER
+        far = float(np.hypot(*(places[i] - middle)))
+        if far > _FAR and near.mean() > _MOSTLY:
+            out[i] = far
+    return out
 
 
 def departs(found: Departure, bent: float = _SURE) -> bool:

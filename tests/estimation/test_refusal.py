@@ -173,3 +173,20 @@ def test_equal_boards_beside_are_told_apart_by_the_design_or_not_at_all(shift, s
         )
         assert abs(middle[0] - shift) < 0.002
     assert with_lookalikes(right, [], 0.025, 0.02) is right
+
+
+def test_a_station_far_from_where_those_around_it_agree_is_ambiguous():
+    sec = S.butt()
+    station = estimate_station(sec, S.scan(np.random.default_rng(2), sec.components), Pose2D(), SENSOR, FIT)
+    assert station.status.name == "ok"
+    drift = [Pose2D(0.002 * k, 0.001 * k) for k in range(14)]
+    joint = [dataclasses.replace(station, s=0.01 * k, combined=pose) for k, pose in enumerate(drift)]
+    before = with_company(joint, [sec] * 14)
+    assert all(e.status.name != "ambiguous" for e in before)
+    joint[6] = dataclasses.replace(joint[6], combined=Pose2D(0.062, 0.006))
+    judged = with_company(joint, [sec] * 14)
+    assert judged[6].status.name == "ambiguous"
+    assert "50 mm from where the stations around it" in judged[6].status.reason
+    assert [e.status for e in judged if e is not judged[6]] == [
+        e.status for e in before if e is not before[6]
+    ]
