@@ -1,9 +1,11 @@
-"""How every kernel is compiled."""
+"""How every kernel is compiled, and when what the cache holds of it is out of date."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numba as nb
@@ -57,9 +59,27 @@ def _compiled(function: Callable[..., Any], **more: bool | set[str]) -> Callable
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": False, **more}
     try:
         compiled: Callable[..., Any] = nb.njit(cache=True, **options)(function)
+        _go_stale_together(compiled, Path(function.__code__.co_filename))
     except RuntimeError:  # numba found no directory for its cache: a read-only installation
         compiled = nb.njit(**options)(function)
     return compiled
+
+
+def _go_stale_together(compiled: Callable[..., Any], file: Path) -> None:
+    """Let the cached code depend on every kernel of its room and on this file.
+
+    Numba looks at the kernel's own file alone: a callee that was edited in another one would stay as it was.
+    """
+    index = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
+    if index is not None:
+        index._source_stamp = _stamps(file.parent)
+
+
+@lru_cache
+def _stamps(room: Path) -> tuple[tuple[str, float, int], ...]:
+    """Name, time of change and size of a room's kernel files."""
+    files = [Path(__file__), *sorted(room.glob("_kernels*.py"))]
+    return tuple((file.name, stat.st_mtime, stat.st_size) for file in files for stat in (file.stat(),))
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 """Numba functions of the likelihood of all beams along a joint under one motion of a component.
 
 Everything is about the component's reference corner: edges as designed, less the corner, and beams from
-their sensor's place, less the corner. Beams ``B`` (9, N) have the rows of :mod:`bimfit.estimation._kernels`,
+their sensor's place, less the corner. Beams ``B`` (9, N) have the rows of :mod:`._kernels_beams`,
 stations one after the other; ``at`` (2, N) is where each starts from. ``first`` (n + 1,) and ``row`` (n + 1,)
 tell where a station's beams and edges begin.
 

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from bimfit.config import FitConfig, SensorConfig
-from bimfit.estimation import _kernels
+from bimfit.estimation import _kernels_sight as kernels
 from bimfit.estimation.cloud import VirtualBeams, irregular_sensor, virtual_beams
 from bimfit.estimation.likelihood import BeamModel, BeamSet
 from bimfit.estimation.ownership import BeamTable, Mask, Sight, Views, beam_table, beside_artificial_ends
@@ -86,9 +86,7 @@ class Context:
         """
         table = self.table
         sight = Sight(
-            *_kernels.look(
-                *self.rows, pose.as_array(), table.rows, table.start, table.eye, _GRAZING, _FAR_OUT
-            )
+            *kernels.look(*self.rows, pose.as_array(), table.rows, table.start, table.eye, _GRAZING, _FAR_OUT)
         )
         a, b = self.section.components
         if a.artificial or b.artificial:
@@ -102,7 +100,7 @@ class Context:
         table = self.table
         at = np.array([(pose.u, pose.v, pose.theta) for pose in poses])
         return Views(
-            *_kernels.weigh(
+            *kernels.weigh(
                 *self.rows, at, self.section.gap.corners, table.rows, table.start, table.eye, usable,
                 self.depth, self.sensor.sigma, _FEW_THROUGH,
             )
@@ -140,7 +138,7 @@ def _expected(section: JointSection, beams: BeamSet, pose: Pose2D, sensor: Senso
     if not sensor.sigma_per_metre > 0.0:
         return None
     (a, b), at = section.components, pose.as_array()
-    ranges, _ = _kernels.scene(a.rows, b.rows, at, at, beams.rays, beams.start, beams.eye)
+    ranges, _ = kernels.scene(a.rows, b.rows, at, at, beams.rays, beams.start, beams.eye)
     return np.asarray(ranges.min(axis=0))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bimfit.config import SensorConfig
-from bimfit.estimation import _kernels
+from bimfit.estimation import _kernels_beams as kernels
 from bimfit.geometry.pose import Array, Pose2D
 from bimfit.geometry.profile import Profile
 from bimfit.geometry.slice import Beams
@@ -103,13 +103,13 @@ class BeamSet:
         o = np.ascontiguousarray(beams.origins, np.float64)
         d = np.ascontiguousarray(beams.directions, np.float64)
         r = np.ascontiguousarray(beams.ranges, np.float64)
-        whole, one = _kernels.whole_beams(o, d, _SAME_ORIGIN)
+        whole, one = kernels.whole_beams(o, d, _SAME_ORIGIN)
         group = np.zeros(len(whole), np.int64)
         if not one:
             near = np.round(o[whole] / _SAME_ORIGIN).astype(np.int64)
             group = np.unique(near, axis=0, return_inverse=True)[1].astype(np.int64).reshape(-1)
         count = int(group.max()) + 1 if len(group) else 0
-        return cls(*_kernels.sort_beams(o, d, r, whole, group, count, _MISSING))
+        return cls(*kernels.sort_beams(o, d, r, whole, group, count, _MISSING))
 
     def __len__(self) -> int:
         return len(self.r)
@@ -150,7 +150,7 @@ class BeamSet:
         The median over the angle that they span, not over the beams: several rows or sweeps whose beams
         nearly coincide are as far apart as their clusters are.
         """
-        return float(_kernels.beam_spacing(self.d))
+        return float(kernels.beam_spacing(self.d))
 
     @property
     def points(self) -> Array:
@@ -165,7 +165,7 @@ class BeamSet:
 
 def usual_step(step: Array) -> float:
     """The step that half of the whole length is made of: each counts by its length; 0 without any."""
-    return float(_kernels.usual_step(np.ascontiguousarray(step, np.float64)))
+    return float(kernels.usual_step(np.ascontiguousarray(step, np.float64)))
 
 
 def edge_rows(profile: Profile, pose: Pose2D | None = None) -> Array:
@@ -193,5 +193,5 @@ def predict_ranges(rows: Array, beams: BeamSet) -> tuple[Array, Ints]:
     """
     rho = np.full(len(beams), np.inf)
     face = np.full(len(beams), -1, np.int64)
-    _kernels.predict(rows, 1.0, 0.0, 0.0, 0.0, beams.rays, beams.start, beams.eye, rho, face)
+    kernels.predict(rows, 1.0, 0.0, 0.0, 0.0, beams.rays, beams.start, beams.eye, rho, face)
     return rho, face

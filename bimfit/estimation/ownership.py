@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bimfit.estimation import _kernels
+from bimfit.estimation import _kernels_beams, _kernels_sight
 from bimfit.estimation.likelihood import BeamModel, BeamSet
 from bimfit.geometry.pose import Array, Pose2D
 
@@ -57,7 +57,7 @@ class BeamTable:
 
     def take(self, keep: Mask) -> BeamTable:
         """The beams for which ``keep`` holds; groups left empty stay."""
-        rows, start = _kernels.taken(self.rows, self.start, keep)
+        rows, start = _kernels_beams.taken(self.rows, self.start, keep)
         return replace(self, rows=rows, start=start)
 
 
@@ -68,7 +68,7 @@ def beam_table(beams: BeamSet, model: BeamModel, margin: float) -> BeamTable:
     neighbouring beam bears out counts as from behind: floors come in runs, outliers alone.
     """
     scale = _NO_SCALE if beams.scale is None else beams.scale
-    rows = _kernels.table(
+    rows = _kernels_beams.table(
         beams.rays, beams.r, scale, 1.0 / model.sigma, math.log(model.amplitude), model.miss, model.past,
         _SAME_SURFACE,
     )  # fmt: skip
@@ -140,7 +140,7 @@ def second_round(
         Height above which a return of the combined ``pose``'s frame is near the mouth, m; inf for nowhere.
     """
     sigma = float(np.hypot(model.sigma, 0.001))
-    use, rows = _kernels.claim(
+    use, rows = _kernels_sight.claim(
         which, views.ranges, sight.side, table.rows, table.eye, table.start, sight.usable, pose.as_array(),
         shallow, sigma, model.amplitude * model.sigma / sigma, model.past,
     )  # fmt: skip

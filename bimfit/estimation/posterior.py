@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bimfit.estimation import _kernels
+from bimfit.estimation import _kernels_posterior as kernels
 from bimfit.estimation.ownership import BeamTable
 from bimfit.geometry.pose import Array, Pose2D
 
@@ -224,7 +224,7 @@ def _integrated(
     """Figures of a posterior as the kernel gives them, shape (36,)."""
     other = _NOWHERE if begin is None else begin.as_array()
     out = np.empty(36)
-    found = _kernels.component(
+    found = kernels.component(
         rows, start.as_array(), other, use, table.rows, table.start, table.eye, table.margin, _NEAR,
         _MIN_HITS, _BEARING * table.spacing, window.deviations, window.reach, window.least, cells, _draws(),
         out,

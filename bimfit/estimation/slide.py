@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 
 from bimfit.config import FitConfig, SensorConfig
-from bimfit.estimation import _kernels
+from bimfit.estimation import _kernels_likelihood as kernels
 from bimfit.estimation.likelihood import BeamModel
 from bimfit.estimation.ownership import BeamTable
 from bimfit.geometry.joint_section import JointSection
@@ -64,7 +64,7 @@ def slide_combined(
         outliers=max(_OUTLIERS, sensor.outlier_share),
     )
     a, b = section.components
-    scores, best, other = _kernels.slide(
+    scores, best, other = kernels.slide(
         a.rows, b.rows, pose.as_array(), shifts, table.rows, table.start, table.eye, 1.0 / model.sigma,
         math.log(model.amplitude), table.margin, min(_PRIOR, max(0.8 * gap, 0.010)), max(0.8 * gap, _APART),
     )  # fmt: skip

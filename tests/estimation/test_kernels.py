@@ -11,7 +11,8 @@ import scipy
 import shapely
 
 from bimfit.config import SensorConfig
-from bimfit.estimation import _kernels
+from bimfit.estimation import _kernels_beams
+from bimfit.estimation import _kernels_likelihood as kernels
 from bimfit.estimation.likelihood import BeamModel, BeamSet, edge_rows, predict_ranges
 from bimfit.estimation.ownership import beam_table
 from bimfit.estimation.posterior import Window, component_posterior
@@ -76,7 +77,7 @@ def test_all_round_scans_and_several_origins_are_predicted_too():
 
 def test_pseudo_angle_sorts_like_atan2():
     a = np.sort(np.random.default_rng(0).uniform(-np.pi, np.pi, 500))
-    p = np.array([_kernels.pseudo_angle(math.cos(x), math.sin(x)) for x in a])
+    p = np.array([_kernels_beams.pseudo_angle(math.cos(x), math.sin(x)) for x in a])
     assert np.all(np.diff(p) > 0)
     assert p.min() >= -2.0
     assert p.max() <= 2.0
@@ -101,7 +102,7 @@ def _with(table, **rows):
     """The table with rows of its own: the cost of covering, the limit."""
     out = table.rows.copy()
     for name, values in rows.items():
-        out[getattr(_kernels, name.upper()), : len(table)] = values
+        out[getattr(_kernels_beams, name.upper()), : len(table)] = values
     return dataclasses.replace(table, rows=out)
 
 
@@ -122,9 +123,9 @@ def test_information_of_a_flat_face_is_the_closed_form():
     local = set_.moved_origin(np.array([0.0, 0.25]))
     rows = edge_rows(BOARD, Pose2D(0.0, -0.25, 0.0))
     exact = dataclasses.replace(local, r=np.where(top, rho, -1e9))
-    _kernels.normal_equations(
+    kernels.normal_equations(
         rows, np.zeros(3), 1.0, beam_table(exact, model, 1.0).rows, local.start, local.eye, 1.0, 1 << 40, 0.0,
-        *_kernels.scratch(rows, local.eye), H, b,
+        *kernels.scratch(rows, local.eye), H, b,
     )  # fmt: skip
     assert np.allclose(np.abs(H), np.abs(expected), rtol=1e-3, atol=1e-3 * np.abs(expected).max())
     assert np.allclose(np.diag(H), np.diag(expected), rtol=1e-3)
@@ -139,8 +140,15 @@ def _lattice(rows, pivot, table, window, around, half, n=41):
     moved = rows.copy()
     moved[:, 0:2] -= pivot
     moved[:, 2:4] -= pivot
-    after = (table.rows, table.start, eye, table.margin, 0.05 * table.spacing, *_kernels.scratch(moved, eye))
-    value = np.array([_kernels.log_likelihood(moved, x, *after) for x in X])
+    after = (
+        table.rows,
+        table.start,
+        eye,
+        table.margin,
+        0.05 * table.spacing,
+        *kernels.scratch(moved, eye),
+    )
+    value = np.array([kernels.log_likelihood(moved, x, *after) for x in X])
     value -= 0.5 * np.sum((X / (window.shift, window.shift, window.angle)) ** 2, axis=1)
     w = np.exp(value - value.max())
     w /= w.sum()
@@ -183,27 +191,27 @@ def test_kernels_do_what_their_python_does():
     n = len(set_)
     rho, face = np.full(n, np.inf), np.full(n, -1, np.int64)
     args = (rows, math.cos(0.02), math.sin(0.02), 1e-3, -2e-3, set_.rays, set_.start, set_.eye)
-    _kernels.predict(*args, rho, face)
+    _kernels_beams.predict(*args, rho, face)
     slow, slow_face = np.full(n, np.inf), np.full(n, -1, np.int64)
-    _kernels.predict.py_func(*args, slow, slow_face)
+    _kernels_beams.predict.py_func(*args, slow, slow_face)
     assert np.array_equal(face, slow_face)
     assert np.allclose(rho[face >= 0], slow[face >= 0], rtol=1e-12)
     common = (rows, np.array([1e-3, -2e-3, 0.02]), table.rows, set_.start, set_.eye, table.margin)
-    space = _kernels.scratch(rows, set_.eye)
-    fast = _kernels.log_likelihood(*common, 3e-4, *space)
-    assert fast == pytest.approx(_kernels.log_likelihood.py_func(*common, 3e-4, *space), rel=1e-12)
+    space = kernels.scratch(rows, set_.eye)
+    fast = kernels.log_likelihood(*common, 3e-4, *space)
+    assert fast == pytest.approx(kernels.log_likelihood.py_func(*common, 3e-4, *space), rel=1e-12)
     covered = face >= 0
     d2 = ((set_.r - rho) / model.sigma) ** 2
     a = model.amplitude * np.exp(-0.5 * d2)
-    naive = np.sum(np.where(covered, np.log1p(a) + table.rows[_kernels.OFF, :n], 0.0))
-    flat = _kernels.log_likelihood(*common, 0.0, *space)
+    naive = np.sum(np.where(covered, np.log1p(a) + table.rows[_kernels_beams.OFF, :n], 0.0))
+    flat = kernels.log_likelihood(*common, 0.0, *space)
     assert flat == pytest.approx(naive, abs=1e-3)
 
 
 def test_the_likelihood_of_one_return_is_the_softplus_of_its_odds():
     t = np.r_[-np.inf, np.linspace(-60.0, 60.0, 4001)]
-    assert np.allclose([_kernels._gain(x) for x in t], np.logaddexp(0.0, t), atol=2e-5)
-    assert np.allclose([_kernels._weight(x) for x in t], scipy.special.expit(t), atol=1e-6)
+    assert np.allclose([kernels._gain(x) for x in t], np.logaddexp(0.0, t), atol=2e-5)
+    assert np.allclose([kernels._weight(x) for x in t], scipy.special.expit(t), atol=1e-6)
 
 
 @pytest.mark.parametrize("eye", [(0.0, 0.25), (-0.3, 0.1), (-0.03, 0.05)])
@@ -218,9 +226,9 @@ def test_stretches_of_beams_meet_the_edges_that_are_predicted_beam_by_beam(eye):
     limit = np.where(rng.random(len(set_)) < 0.1, 0.01, np.inf)
     off = rng.normal(0.0, 1.0, len(set_))
     table = _with(beam_table(seen, model, 1.0), off=off, deep=0.0, limit=limit)
-    total = _kernels.log_likelihood(
+    total = kernels.log_likelihood(
         rows, np.zeros(3), table.rows, seen.start, seen.eye, table.margin, 0.0,
-        *_kernels.scratch(rows, seen.eye),
+        *kernels.scratch(rows, seen.eye),
     )  # fmt: skip
     covered = (face >= 0) & (rho < limit)
     odds = math.log(model.amplitude) - 0.5 * ((seen.r - rho)[covered] / model.sigma) ** 2
@@ -235,7 +243,14 @@ def test_a_return_from_behind_counts_only_where_something_should_have_stopped_it
     behind = np.where(np.isfinite(rho), rho + 0.1, 0.6)
     table = beam_table(dataclasses.replace(set_, r=behind), model, 0.012)
     B = _with(table, off=0.0, deep=model.past).rows
-    total = _kernels.log_likelihood(
-        rows, np.zeros(3), B, set_.start, set_.eye, table.margin, 0.0, *_kernels.scratch(rows, set_.eye)
+    total = kernels.log_likelihood(
+        rows,
+        np.zeros(3),
+        B,
+        set_.start,
+        set_.eye,
+        table.margin,
+        0.0,
+        *kernels.scratch(rows, set_.eye),
     )
     assert total == pytest.approx(model.past * covered.sum(), rel=1e-9)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bimfit.config import FitConfig, SensorConfig
-from bimfit.estimation import _kernels
+from bimfit.estimation import _kernels_beams, _kernels_likelihood
 from bimfit.estimation.cells import with_shared_cells
 from bimfit.estimation.likelihood import BeamModel, BeamSet, edge_rows
 from bimfit.estimation.motion import estimate_joint
@@ -53,7 +53,7 @@ def _beams(section, slice_, which):
     model = BeamModel.of(SensorConfig())
     table, rows = beam_table(beams, model, 0.012), edge_rows(section.components[which])
     every = table.rows.copy()
-    every[_kernels.LIMIT, : len(beams)] = np.where(np.arange(len(beams)) % 9 == 4, 0.27, np.inf)
+    every[_kernels_beams.LIMIT, : len(beams)] = np.where(np.arange(len(beams)) % 9 == 4, 0.27, np.inf)
     table = dataclasses.replace(table, rows=every, spacing=6e-3)
     heard = Heard(rows, table, np.ones(len(beams), bool))
     assert heard.bearing == pytest.approx(3e-4)
@@ -61,8 +61,8 @@ def _beams(section, slice_, which):
 
     def likelihood(x):
         pose = Pose2D.about(corner, *x).as_array()
-        lines, runs = _kernels.scratch(rows, beams.eye)
-        return _kernels.log_likelihood(
+        lines, runs = _kernels_likelihood.scratch(rows, beams.eye)
+        return _kernels_likelihood.log_likelihood(
             rows, pose, every, beams.start, beams.eye, table.margin, 3e-4, lines, runs
         )
 

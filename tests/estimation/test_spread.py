@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bimfit.config import SensorConfig
-from bimfit.estimation import _kernels
+from bimfit.estimation import _kernels_beams
 from bimfit.estimation.likelihood import BeamModel, BeamSet
 from bimfit.estimation.ownership import beam_table
 from bimfit.estimation.spread import run_weights, with_spread
@@ -47,5 +47,5 @@ def test_independent_beams_that_deviate_alike_are_left_as_they_are():
     assert both.scale[[0, -1]] == pytest.approx(np.sqrt(0.5))
     kept = beam_table(both, BeamModel.of(SensorConfig(sigma=0.002)), 1.0).take(np.arange(9) > 3)
     assert len(kept) == 5
-    assert np.allclose(kept.rows[_kernels.INVERSE, :5] * both.scale[4:], 500.0)
+    assert np.allclose(kept.rows[_kernels_beams.INVERSE, :5] * both.scale[4:], 500.0)
     assert np.all(kept.rows[:, 5:] == 0.0)
