@@ -19,7 +19,7 @@ from bimfit.geometry.visibility import clip_edges, visible_edges
 from bimfit.registration.table import Tables, Target
 from bimfit.simulation.rangefinder import aim
 
-COMBINED_PAYS, COMPONENT_PAYS = 3000.0, 1000.0
+COMBINED_PAYS, COMPONENT_PAYS = 3000.0, 300.0
 """Cells of majorant tables that a slice pays for, in the wide and in a component's small window; measured."""
 _MARGIN = 0.1
 """How much farther than the components' profiles a scan is used, since they may have moved, m."""
