@@ -78,6 +78,14 @@ def _shallow(context: Context, views: Views) -> float:
     return -_SHALLOW * context.sensor.sigma if views.passed > 0 else math.inf
 
 
+def _behind(context: Context, views: Views, pose: Pose2D) -> Mask:
+    """Returns from at or behind the gap's root that nothing designed should have stopped: no slope."""
+    root = float(min(side[-1, 1] for side in (context.section.gap.side_a, context.section.gap.side_b)))
+    low = pose.inverse().apply(context.beams.points)[:, 1] < root + context.sensor.sigma
+    passed = ~np.isfinite(views.ranges[:, : len(low)]).any(axis=0)
+    return np.asarray(low & passed & (context.beams.r > 0.0))
+
+
 def _one(
     context: Context, which: int, prior: Pose2D, use: Mask, table: BeamTable | None, begin: Pose2D | None
 ) -> Posterior | None:
@@ -197,7 +205,8 @@ class Reshaper:
         a, b = (pose if c.pose is None else c.pose for c in self.station.components)
         views = context.weigh((a, b), sight.usable)
         shallow = _shallow(context, views)
+        away = ~_behind(context, views, pose)
         first, second = (
             second_round(which, views, sight, context.table, context.model, pose, shallow) for which in (0, 1)
         )
-        return first, second
+        return (first[0] & away, first[1]), (second[0] & away, second[1])

@@ -99,7 +99,7 @@ def departure(
     Parameters
     ----------
     stations, sections : sequence
-        One a station; those without a pose do not count.
+        One a station; those whose component is rejected or has no pose do not count.
     correlation : float
         Of neighbouring beams' noise: pooled means are that much less certain.
     bins : int
@@ -147,7 +147,7 @@ class _Returns:
         """Those of one station that belong to their face for certain; None where there are hardly any."""
         c = station.components[which]
         r = c.residuals
-        if c.pose is None or len(r.feet) < _LEAST:
+        if c.pose is None or not c.status.measured or len(r.feet) < _LEAST:
             return None
         feet = c.pose.inverse().apply(r.feet)
         along, clear, normals = on_outline(profile, feet, r.faces)
