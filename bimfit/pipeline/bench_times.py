@@ -20,7 +20,7 @@ from bimfit.geometry.joint_section import JointSection
 from bimfit.geometry.slice import Slice
 from bimfit.pipeline.compare import Cut
 from bimfit.pipeline.fit import DESIGNED, StationFit, estimate_fits, search_stations
-from bimfit.pipeline.targets import TargetCache, Targets, build_seconds, prepare
+from bimfit.pipeline.targets import TargetCache, Targets, prepare
 from bimfit.registration.matchers import match_all
 from bimfit.simulation.accuracy import PAPER_SECONDS_A_SLICE
 
@@ -55,7 +55,8 @@ def _round(
     searched, search = _timed(lambda: search_stations(sections, slices, targets, config))
     fits, estimate = _timed(lambda: estimate_fits(searched, config.sensor, config))
     row = {"search": search, "estimate": estimate, **_parts(fits, targets, config)}
-    row["tables"] = sum(build_seconds(target) for target in targets.all)
+    fresh = prepare(sections, slices, TargetCache(config))[0]
+    row["tables"] = _timed(lambda: search_stations(sections[:1], slices[:1], fresh, config))[1]
     estimates = [fit.estimate for fit in fits if fit.estimate is not None]
     return {
         **{name: seconds / len(fits) for name, seconds in row.items()},
