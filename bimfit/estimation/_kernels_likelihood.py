@@ -229,7 +229,8 @@ def log_likelihood(
                 first += 1
             if first == end:
                 continue
-            if bearing > 0.0 and nx * B[1, first] + ny * B[2, first] > -STEEP:
+            least = max(nx * B[1, first] + ny * B[2, first], nx * B[1, end - 1] + ny * B[2, end - 1])
+            if bearing > 0.0 and least > -STEEP:
                 total += _steep_sum(B, first, end, nx, ny, c, margin, bearing)
             else:
                 total += _sum(B, first, end, nx, ny, c, margin)
@@ -271,15 +272,25 @@ def _stretch(
 
 
 @jit_inner
+def _square_on(B: Array, first: int, end: int, nx: float, ny: float) -> tuple[int, int]:
+    """A stretch of beams on one face without those at its ends that graze it; |n.d| has one maximum."""
+    while first < end and nx * B[1, first] + ny * B[2, first] > -STEEP:
+        first += 1
+    while first < end and nx * B[1, end - 1] + ny * B[2, end - 1] > -STEEP:
+        end -= 1
+    return first, end
+
+
+@jit_inner
 def normal_equations(
     edges: Array, pose: Array, rs: float, B: Array, start: Ints, eye: Array, soften: float, grazes: int,
     bearing: float, lines: Array, runs: Ints, H: Array, g: Array,
 ) -> None:  # fmt: skip
     """Gauss-Newton system of the ranges in (tx, ty, theta * rs), rotation about the origin of ``edges``.
 
-    Weights a / (1 + a), a = A / m exp(-d^2 / (2 m^2)), m = ``soften`` times sigma. A face met nearly edge-on
-    counts from ``grazes`` returns on: the Jacobian of a few claims more than they say. ``lines``, ``runs``:
-    from :func:`scratch`.
+    Weights a / (1 + a), a = A / m exp(-d^2 / (2 m^2)), m = ``soften`` times sigma. Beams that meet a face
+    nearly edge-on count where ``grazes`` or more are on it: the Jacobian of a few claims more than they say.
+    ``lines``, ``runs``: from :func:`scratch`.
     """
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     H[:] = 0.0
@@ -294,9 +305,12 @@ def normal_equations(
                 first += 1
             if first == end:
                 continue
-            steep = nx * B[1, first] + ny * B[2, first] > -STEEP
+            square, last = _square_on(B, first, end, nx, ny)
+            steep = square > first or last < end
             if steep and end - first < grazes:
-                continue
+                first, end, steep = square, last, False
+                if first == end:
+                    continue
             # n.(a - o) is common to a stretch on one face, and so is the Jacobian's direction
             s0, s1, s2, t0, t1 = _stretch(
                 B, first, end, nx, ny, c, (ny * ox - nx * oy) / rs, slope, soft, drop,

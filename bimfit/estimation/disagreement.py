@@ -114,6 +114,12 @@ def _alone(s: Array, knots: Array) -> list[int]:
     return [int(at[j]) for j in range(1, len(at) - 1) if at[j + 1] - at[j - 1] == 2]
 
 
+def distance_off(sites: Sites, fit: Trend, i: int) -> float:
+    """How far a station is off the trend, m, or off its neighbours where the trend bends to follow it."""
+    off = float(np.hypot(*(sites.value[i] - fit.value[i])[:2]))
+    return max(off, _off_neighbours(sites, fit, i)[0]) if 0 < i < len(sites.s) - 1 else off
+
+
 def _off_neighbours(sites: Sites, fit: Trend, i: int) -> tuple[float, float]:
     """How far a station is off the line through its neighbours' values, m, and squared in deviations."""
     w = (sites.s[i] - sites.s[i - 1]) / (sites.s[i + 1] - sites.s[i - 1])

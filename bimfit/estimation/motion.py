@@ -15,7 +15,7 @@ from bimfit.estimation import trend
 from bimfit.estimation.borrow import FLAG, SHAKES, at_corner, at_corners, borrow
 from bimfit.estimation.cells import SharedCells, shared_cells, with_shared_cells
 from bimfit.estimation.checks import DOZEN
-from bimfit.estimation.disagreement import disagreements
+from bimfit.estimation.disagreement import disagreements, distance_off
 from bimfit.estimation.pooled import pooled
 from bimfit.estimation.result import ComponentEstimate, StationEstimate
 from bimfit.estimation.trend import Basis, Sites, Trend
@@ -343,9 +343,9 @@ def _apply(
             pose, covariance = _mixed(t, i, corner, c)
             if t.distance[i] > FLAG:
                 outliers.append((i, "AB"[which]))
-                off = float(np.hypot(*(parts[which].value[i] - t.value[i])[:2])) * 1e3
-                reason = f"its own returns put it {off:.1f} mm away from what its neighbours say"
-                if status.name == "weak" and off > 1e3 * SHAKES:
+                off = distance_off(parts[which], t, i)
+                reason = f"its own returns put it {1e3 * off:.1f} mm away from what its neighbours say"
+                if status.name == "weak" and off > SHAKES:
                     # a place that no gap bears out and no neighbour either is none
                     status = Status("rejected", f"component {'AB'[which]}: {reason}, and {status.reason}")
                 if status.name == "ok":

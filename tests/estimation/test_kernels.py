@@ -131,6 +131,34 @@ def test_information_of_a_flat_face_is_the_closed_form():
     assert np.allclose(np.diag(H), np.diag(expected), rtol=1e-3)
 
 
+@pytest.mark.parametrize("ends", [(-1.5, 1.5), (-1.5, 0.1), (-0.1, 1.5)])
+def test_of_a_face_that_some_beams_graze_the_others_count(ends):
+    """METHOD section 4, step 5: hits with |n.d| under 0.3 stay out, and no others."""
+    (low, high), sigma = ends, 1e-4
+    rows = edge_rows(Profile.polygon([(low, -0.25), (low, -0.3), (high, -0.3), (high, -0.25)]))
+    beams = _fan((0.0, 0.0), half=40, step=math.radians(2.0))
+    set_ = BeamSet.of(beams)
+    rho, _ = predict_ranges(rows, set_)
+    hit = np.isfinite(rho)
+    dx, dy = set_.d
+    for fewest, counted in ((1 << 40, hit & (-dy >= 0.3)), (2, hit)):
+        alpha, phi = -np.pi / 2, np.arctan2(dy, dx)[counted]
+        g = np.stack(
+            [np.zeros_like(phi), 1.0 / np.cos(alpha - phi), rho[counted] * np.tan(alpha - phi)], axis=1
+        )
+        model = BeamModel.of(SensorConfig(sigma=sigma))
+        table = beam_table(dataclasses.replace(set_, r=np.where(hit, rho, -1e9)), model, 1.0)
+        H, b = np.empty((3, 3)), np.empty(3)
+        kernels.normal_equations(
+            rows, np.zeros(3), 1.0, table.rows, set_.start, set_.eye, 1.0, fewest, 0.0,
+            *kernels.scratch(rows, set_.eye), H, b,
+        )  # fmt: skip
+        assert 0 < counted.sum() < (hit.sum() if fewest > 2 else hit.sum() + 1)
+        assert np.allclose(
+            np.abs(H), np.abs(g.T @ g) / model.sigma**2, rtol=1e-3, atol=1e-3 * np.abs(H).max()
+        )
+
+
 def _lattice(rows, pivot, table, window, around, half, n=41):
     """Mean and covariance by brute force over a dense lattice of (u, v, theta) about the pivot."""
     grid = [np.linspace(m - h, m + h, n) for m, h in zip(around, half, strict=True)]
