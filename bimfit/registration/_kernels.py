@@ -1,10 +1,10 @@
-"""Every compiled function of the planar search, in one file so that the compiled cache cannot go stale.
+"""Every compiled function of the planar search.
 
 The kernels take arrays and plain numbers only; ``table.py`` and ``grcsm.py`` validate and allocate.
 Integers throughout: a bound is a bound of the very scores that it prunes, and sums do not depend on order.
 Sums of quadratic bounds are the exception: single precision in any order, with a margin for rounding.
 ``fastmath``, which assumes that NaN does not exist, only there: cells and tables hold none.
-Constants of ``_kernels_table.py`` are compiled in: remove ``__pycache__`` after a change to them.
+Constants of ``_kernels_table.py`` are compiled in; a change to any kernel file of the room makes all anew.
 """
 
 from __future__ import annotations
