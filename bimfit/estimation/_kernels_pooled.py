@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bimfit._kernels import jit, jit_inner
+from bimfit.estimation._kernels_beams import DEEP, INVERSE, LIMIT, OFF, RANGE, STEEP, TOP
 from bimfit.geometry.pose import Array
 
 Ints = NDArray[np.int64]
-_RANGE, _OFF, _DEEP, _LIMIT, _INVERSE, _TOP = 3, 4, 5, 6, 7, 8
-_STEEP = 0.3
 _SPREAD = 5.0
 """A corner may be that many standard deviations from where it is expected."""
 
@@ -64,14 +63,14 @@ def _value(B: Array, k: int, near: float, slope: float, margin: float, bearing: 
 
     ``slope`` is n.d there: on a face nearly edge-on the range depends on the bearing most of all.
     """
-    z = B[_RANGE, k] - near
-    q = z * B[_INVERSE, k]
-    t = B[_TOP, k] - 0.5 * q * q
-    if bearing > 0.0 and slope > -_STEEP:
-        grow = 1.0 + (bearing * B[_INVERSE, k] * near) ** 2 * (1.0 / (slope * slope) - 1.0)
-        t = B[_TOP, k] - 0.5 * (q * q / grow + math.log(grow))
+    z = B[RANGE, k] - near
+    q = z * B[INVERSE, k]
+    t = B[TOP, k] - 0.5 * q * q
+    if bearing > 0.0 and slope > -STEEP:
+        grow = 1.0 + (bearing * B[INVERSE, k] * near) ** 2 * (1.0 / (slope * slope) - 1.0)
+        t = B[TOP, k] - 0.5 * (q * q / grow + math.log(grow))
     gain = t if t > 30.0 else (math.log1p(math.exp(t)) if t > -30.0 else 0.0)
-    return float(gain + B[_OFF, k] + (B[_DEEP, k] if z > margin else 0.0))
+    return float(gain + B[OFF, k] + (B[DEEP, k] if z > margin else 0.0))
 
 
 @jit
@@ -108,16 +107,16 @@ def expand(
             if near_edge[k]:
                 continue
             near, e = _meet(moved, count, ox, oy, dx, dy)
-            if e < 0 or not near < B[_LIMIT, k]:
+            if e < 0 or not near < B[LIMIT, k]:
                 continue
             slope = moved[e, 4] * dx + moved[e, 5] * dy
-            if slope > -_STEEP:
+            if slope > -STEEP:
                 near_edge[k] = True
                 continue
-            z = B[_RANGE, k] - near
-            q = z * B[_INVERSE, k]
-            odds = math.exp(min(B[_TOP, k] - 0.5 * q * q, 50.0))
-            w = odds / (1.0 + odds) * B[_INVERSE, k] ** 2
+            z = B[RANGE, k] - near
+            q = z * B[INVERSE, k]
+            odds = math.exp(min(B[TOP, k] - 0.5 * q * q, 50.0))
+            w = odds / (1.0 + odds) * B[INVERSE, k] ** 2
             px, py = ox + near * dx - x[0], oy + near * dy - x[1]
             J[0], J[1] = moved[e, 4] / slope, moved[e, 5] / slope
             J[2] = J[1] * px - J[0] * py
@@ -186,6 +185,6 @@ def log_likelihoods(
             _moved(edges, row[i], row[i + 1], x, moved)
             for k in range(first[i], first[i + 1]):
                 near, e = _meet(moved, count, at[0, k], at[1, k], B[1, k], B[2, k])
-                if e >= 0 and near < B[_LIMIT, k]:
+                if e >= 0 and near < B[LIMIT, k]:
                     slope = moved[e, 4] * B[1, k] + moved[e, 5] * B[2, k]
                     out[s] += _value(B, k, near, slope, margin[i], bearing[i])

@@ -153,10 +153,10 @@ class JointResult:
         return any(station.gap is not None for station in self.stations)
 
     @property
-    def share_without_data(self) -> float:
-        """Share of the stations that hold too little to say anything, 0 to 1; 1 without stations."""
-        none = [station.status.name == "no_data" for station in self.stations]
-        return sum(none) / len(none) if none else 1.0
+    def without_data(self) -> bool:
+        """Whether what most of its stations say is that they hold too little to say anything."""
+        commonest = self.reason
+        return any(e.status.name == "no_data" and e.status.reason == commonest for e in self.stations)
 
     @property
     def reason(self) -> str:

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 Cut: TypeAlias = "tuple[Joint, tuple[JointSection, ...], tuple[Slice, ...]]"
 LEAST_SHOWN = 0.7
 """A joint not asked for by name is fitted where both components show at this share of its stations."""
-MOST_WITHOUT_DATA = 0.5
-"""... and, if nothing of it was measured, kept where at most this share of its stations has no data."""
 SURFACE = 0.1
 """How far from a component's mouth corner its visible surface is looked at, m."""
 NEAR = 0.04
@@ -47,7 +45,7 @@ def fitted_shown(results: Sequence[JointResult]) -> tuple[list[JointResult], lis
 
     That something is missing where it should be is a result and stays, and where none is left all do.
     """
-    kept = [r for r in results if r.measured or r.share_without_data <= MOST_WITHOUT_DATA]
+    kept = [r for r in results if r.measured or not (r.without_data or not r.stations)]
     if not kept:
         return list(results), []
     ids = {r.joint.id for r in kept}

@@ -71,11 +71,11 @@ def test_fitted_joints_without_data_are_left_out_and_those_with_something_missin
     empty, absent, mixed = (
         fitted(made[0], nothing, nothing, missing),
         fitted(made[1], missing, missing, missing, nothing),
-        fitted(made[2], nothing, missing),
+        fitted(made[2], missing, nothing),
     )
     kept, others = fitted_shown([empty, absent, mixed])
     assert [each.joint.id for each in kept] == [absent.joint.id, mixed.joint.id]
     assert others == [empty.joint.id]
     assert fitted_shown([empty])[1] == []
-    assert [mixed.reason, absent.reason] == [nothing.reason, missing.reason]
+    assert [empty.reason, mixed.reason, absent.reason] == [nothing.reason, missing.reason, missing.reason]
     assert mixed.reason == mixed.stations[0].status.reason  # of equals the first, in every run

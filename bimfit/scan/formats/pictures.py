@@ -177,7 +177,9 @@ def read_sick(path: Path, options: ReadOptions) -> LineScan:
     except (json.JSONDecodeError, UnicodeDecodeError, binascii.Error, RecursionError) as error:
         raise ScanError(f"not JSON, or cut short: {error}", file=path) from error
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise ScanError(f"not a height map of SICK: {error!r}", file=path) from error
+        what = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+        remedy = "name a scan; the truth and the results of bimfit are none"
+        raise ScanError(f"not a height map of SICK: {what}", file=path, remedy=remedy) from error
     if not all(np.isfinite(size) and size != 0.0 for size in sizes) or not np.isfinite(origin).all():
         raise ScanError("the pixels have no size", file=path)
     pixels = np.frombuffer(raw, kind).reshape(shape)
